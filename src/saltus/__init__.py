@@ -1,0 +1,38 @@
+"""State estimation and tracking for systems that jump."""
+
+from importlib import import_module
+from typing import Any
+
+# Lazy (PEP 562): the program's --version and --help need none of the numerics.
+_EXPORTS = {
+    "Chain": "saltus.models",
+    "DataError": "saltus.errors",
+    "Estimates": "saltus.filters",
+    "Gaussian": "saltus.models",
+    "HybridModel": "saltus.models",
+    "IMM": "saltus.filters",
+    "LinearSDE": "saltus.models",
+    "LinearSensor": "saltus.models",
+    "ModelError": "saltus.errors",
+    "NumericalError": "saltus.errors",
+    "SaltusError": "saltus.errors",
+    "discretise": "saltus.models",
+    "imm_filter": "saltus.filters",
+    "spherical_to_cartesian": "saltus.geo",
+}
+
+__all__ = sorted(_EXPORTS)
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("saltus")
+    if name in _EXPORTS:
+        return getattr(import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module 'saltus' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -1,0 +1,92 @@
+"""The program `saltus`: each command is one function elsewhere, imported when it runs."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from saltus.errors import SaltusError
+
+__all__ = ["main"]
+
+_FILE = click.Path(path_type=Path)
+
+
+class _Group(click.Group):
+    def invoke(self, ctx: click.Context) -> object:
+        """Turn every expected failure into one clear line and a non-zero exit status."""
+        try:
+            return super().invoke(ctx)
+        except SaltusError as error:
+            click.echo(f"saltus: {error}", err=True)
+            sys.exit(2)
+        except OSError as error:
+            click.echo(f"saltus: {error.strerror or error}: {error.filename}", err=True)
+            sys.exit(2)
+        except KeyboardInterrupt:
+            click.echo("saltus: interrupted; nothing half-written was left", err=True)
+            sys.exit(130)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="saltus", prog_name="saltus")
+def main() -> None:
+    """State estimation and tracking for systems that jump."""
+
+
+@main.command()
+@click.argument("inputs", nargs=-1, required=True, type=_FILE)
+@click.option("--config", type=_FILE, help="TOML file: date, editions.")
+@click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
+def info(inputs: tuple[Path, ...], config: Path | None, date: str | None) -> None:
+    """Say what is in a recording: systems, counts, time span, period, fields, rejected reports."""
+    from saltus.info import show_info
+
+    show_info(inputs, config, date)
+
+
+@main.command()
+@click.argument("inputs", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--output", required=True, type=_FILE, help="Output directory.")
+@click.option("--config", type=_FILE, help="TOML file: date, [[sensor]] sites and noise, tracker settings.")
+@click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
+@click.option("--identity", type=click.Choice(["use", "ignore"]), default="use", show_default=True)
+@click.option("--from", "time_from", metavar="TIME", help="First time, HH:MM[:SS] or ISO 8601, UTC.")
+@click.option("--to", "time_to", metavar="TIME", help="Last time, HH:MM[:SS] or ISO 8601, UTC.")
+@click.option("--no-report", is_flag=True, help="Do not write report.html.")
+def track(
+    inputs: tuple[Path, ...],
+    output: Path,
+    config: Path | None,
+    date: str | None,
+    identity: str,
+    time_from: str | None,
+    time_to: str | None,
+    no_report: bool,
+) -> None:
+    """Track recordings: tracks.parquet, assignments.parquet, summary.json, report.html in OUTPUT."""
+    from saltus.run import track_files
+
+    track_files(inputs, output, config, date, identity, time_from, time_to, report=not no_report)
+
+
+@main.command()
+@click.argument("name")
+@click.option("-o", "--output", required=True, type=_FILE, help="Output directory.")
+@click.option("--runs", type=click.IntRange(min=2), help="Monte-Carlo runs (default: the study's own).")
+@click.option("--seed", type=int, default=0, show_default=True)
+def study(name: str, output: Path, runs: int | None, seed: int) -> None:
+    """Run the study NAME: metrics.json and pictures in OUTPUT."""
+    from saltus.studies import run_study
+
+    run_study(name, output, runs, seed)
+
+
+@main.command()
+@click.option("-o", "--output", default="saltus-demo", show_default=True, type=_FILE, help="Output directory.")
+@click.option("--seed", type=int, default=0, show_default=True)
+def demo(output: Path, seed: int) -> None:
+    """Simulate two radars (manoeuvres, clutter, missed detections), write ASTERIX, track the files."""
+    from saltus.demo import run_demo
+
+    run_demo(output, seed)

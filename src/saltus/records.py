@@ -1,0 +1,200 @@
+"""Target reports as arrays: what every reader returns and every tracker takes.
+
+SI units and radians throughout; NaN marks an absent number, -1 an absent code. Angles of azimuth count from
+north, clockwise. Readers convert once, in float64, whatever the precision of the file.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+__all__ = ["REASONS", "Contents", "Kind", "Plots", "Recording", "Source", "System"]
+
+# Why a report is not used. Index 0 means usable; readers set the codes below, trackers never change them.
+REASONS = (
+    "",
+    "status message",  # not a target report (never listed in assignments)
+    "coasted by station",  # I048/020 TYP = 0: an extrapolated position, not a detection
+    "simulated",  # SIM bit
+    "test target",  # TST bit
+    "field monitor",  # RAB bit: fixed transponder
+    "no position",
+    "no time",
+    "out of range",  # a value that cannot be (units?)
+    "not a number",
+    "duplicate",  # same source, time and position as an earlier report
+    "out of order",  # older than the newest report of its source by more than the sorting window
+    "clock jump",  # time stands alone among its neighbours in the file
+    "outside time window",  # --from / --to
+    "site unknown",  # the source needs a site position and none is configured
+    "system track",  # CAT062: another system's track, never used as a plot
+)
+
+
+class Kind:
+    """How a report gives its position (values of `Plots.kind`)."""
+
+    NONE = 0
+    POLAR = 1  # slant range, azimuth (and elevation when the radar measures it), from the source's site
+    PLANE = 2  # east, north from the source's site
+    GEODETIC = 3  # latitude, longitude
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """A surveillance system: (category, SAC, SIC) for ASTERIX, a name for tables."""
+
+    category: int | None
+    sac: int | None
+    sic: int | None
+    name: str = ""
+
+    def __str__(self) -> str:
+        """Like `CAT048:20/129`, or the name for tables."""
+        if self.category is None:
+            return self.name
+        return f"CAT{self.category:03d}:{self.sac}/{self.sic}"
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One system as it occurs in the inputs, with the quantisation of its reports.
+
+    Quantisation steps (one least significant bit): `range_lsb`, `xy_lsb`, `altitude_lsb` in m, `azimuth_lsb` in
+    rad, `time_lsb` in s; 0 where the format does not quantise.
+    """
+
+    system: System
+    range_lsb: float = 0.0
+    azimuth_lsb: float = 0.0
+    xy_lsb: float = 0.0
+    altitude_lsb: float = 0.0
+    time_lsb: float = 0.0
+
+
+def _column(dtype: npt.DTypeLike, absent: object) -> npt.NDArray:  # type: ignore[type-arg]  # dtype differs
+    return field(metadata={"dtype": np.dtype(dtype), "absent": absent})  # type: ignore[no-any-return]  # a dataclass field
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plots:
+    """Target reports of one or several sources, one array element each, all columns of one length N."""
+
+    sources: tuple[Source, ...]
+    files: tuple[str, ...]
+    time: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # s, UTC
+    source: npt.NDArray[np.int32] = _column(np.int32, -1)  # index into sources
+    file: npt.NDArray[np.int32] = _column(np.int32, -1)  # index into files
+    record: npt.NDArray[np.int64] = _column(np.int64, -1)  # index among that file's records of that category
+    kind: npt.NDArray[np.int8] = _column(np.int8, Kind.NONE)
+    range: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # slant range, m
+    azimuth: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad from north, clockwise
+    elevation: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad above the site's horizontal plane
+    x: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m east of the site
+    y: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m north of the site
+    latitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad, WGS-84
+    longitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad
+    altitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m; pressure altitude if from Mode C
+    icao24: npt.NDArray[np.int32] = _column(np.int32, -1)
+    mode3a: npt.NDArray[np.int16] = _column(np.int16, -1)  # the 12 bits, shown in octal
+    callsign: npt.NDArray[np.str_] = _column("U8", "")
+    on_ground: npt.NDArray[np.int8] = _column(np.int8, -1)  # 1 ground, 0 airborne, -1 not said
+    local_id: npt.NDArray[np.int32] = _column(np.int32, -1)  # the source's own track number
+    reason: npt.NDArray[np.int8] = _column(np.int8, 0)  # index into REASONS; 0 = usable
+
+    @classmethod
+    def build(
+        cls, n: int, sources: tuple[Source, ...], files: tuple[str, ...], columns: Mapping[str, npt.ArrayLike]
+    ) -> Self:
+        """Make `n` reports from the columns given; the others hold their absent value.
+
+        Columns are converted to the class's types (so float32 input becomes float64 here, before any geometry).
+        """
+        unknown = set(columns) - set(cls.column_names())
+        if unknown:
+            raise ValueError(f"no such column: {', '.join(sorted(unknown))}")
+        arrays = {}
+        for f in fields(cls):
+            if f.name in ("sources", "files"):
+                continue
+            dtype, absent = f.metadata["dtype"], f.metadata["absent"]
+            given = columns.get(f.name)
+            arrays[f.name] = np.full(n, absent, dtype) if given is None else np.asarray(given).astype(dtype)
+            if arrays[f.name].shape != (n,):
+                raise ValueError(f"column {f.name!r} has shape {arrays[f.name].shape}, expected ({n},)")
+        return cls(sources, files, **arrays)
+
+    def __len__(self) -> int:
+        """Number of reports."""
+        return len(self.time)
+
+    def take(self, index: npt.NDArray[np.generic] | slice) -> Self:
+        """Return the reports selected by an index array, a mask or a slice."""
+        return replace(self, **{name: getattr(self, name)[index] for name in self.column_names()})
+
+    @classmethod
+    def column_names(cls) -> list[str]:
+        """Names of the per-report columns."""
+        return [f.name for f in fields(cls) if f.name not in ("sources", "files")]
+
+    @classmethod
+    def concat(cls, parts: list[Self]) -> Self:
+        """Join reports of several files; equal systems become one source."""
+        sources: list[Source] = []
+        files: list[str] = []
+        columns: dict[str, list[npt.NDArray[np.generic]]] = {name: [] for name in cls.column_names()}
+        for part in parts:
+            source_idx = np.array([_index_of(sources, s) for s in part.sources], np.int32)
+            for name in columns:
+                columns[name].append(getattr(part, name))
+            columns["source"][-1] = source_idx[part.source] if len(part) else part.source
+            columns["file"][-1] = part.file + np.int32(len(files))
+            files.extend(part.files)
+        n = sum(len(p) for p in parts)
+        if not parts:
+            return cls.build(0, (), (), {})
+        return cls.build(n, tuple(sources), tuple(files), {k: np.concatenate(v) for k, v in columns.items()})
+
+    def sorted_by_time(self) -> Self:
+        """Return the reports in time order (stable)."""
+        return self.take(np.argsort(self.time, kind="stable"))
+
+
+def _index_of(sources: list[Source], source: Source) -> int:
+    for i, known in enumerate(sources):
+        if known.system == source.system:
+            return i
+    sources.append(source)
+    return len(sources) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What one file holds of one system: the lines of `saltus info`."""
+
+    file: str
+    system: System
+    edition: str  # "" for tables
+    n_records: int
+    n_reports: int  # target reports
+    time_from: float
+    time_to: float
+    update_period: float  # s, NaN when it cannot be told
+    fields: dict[str, int]  # item -> number of records that carry it
+    rejected: dict[str, int]  # reason -> number of target reports
+    n_by_type: dict[str, int]  # message or detection type -> number
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Everything read from the inputs: reports in time order, other systems' tracks, a list of contents."""
+
+    plots: Plots
+    tracks: pa.Table | None  # CAT062: system, time, track_number, latitude, longitude (deg), vx, vy, ...
+    contents: tuple[Contents, ...]
+    problems: tuple[str, ...]  # what could not be read, with file and byte or row
