@@ -1,1 +1,1 @@
-""""""
+"""Package under construction."""
