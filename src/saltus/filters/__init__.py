@@ -1,1 +1,8 @@
-"""Package under construction."""
+"""What we believe: the recursion, the batch filter and the bank of tracks."""
+
+from saltus.filters.bank import Bank
+from saltus.filters.estimates import Estimates
+from saltus.filters.imm import imm_filter
+from saltus.filters.steps import Belief
+
+__all__ = ["Bank", "Belief", "Estimates", "imm_filter"]

@@ -1,0 +1,200 @@
+"""One reading of array shapes for every backend: from the right, fixed by the number of chains.
+
+With C = len(trans) chains, a model array is `(*batch, T|1, M1|1, ..., MC|1, rows, cols)`; leading axes may be
+absent. ndim C+2 (rows, cols and one axis per chain) is constant, C+3 time varying, more is per run.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.errors import DataError, ModelError
+
+__all__ = ["Aligned", "align"]
+
+_Array = npt.NDArray[np.float64]
+_MAX_EIGEN_CHECKS = 4096  # matrices whose eigenvalues are looked at; beyond, the update's Cholesky tells
+
+
+class Aligned(NamedTuple):
+    """Canonical inputs: every array carries all its axes, absent ones with length 1 (stride 0 when broadcast)."""
+
+    z: _Array  # (*batch, T, m), 0 where missing
+    seen: npt.NDArray[np.bool_]  # (*batch, T, m)
+    F: _Array  # (*batch|1, T|1, M1|1, ..., n, n)
+    Q: _Array
+    H: _Array  # (..., m, n)
+    R: _Array  # (..., m, m)
+    b: _Array | None  # (..., n)
+    d: _Array | None  # (..., m)
+    trans: tuple[_Array | None, ...]  # (*batch|1, T|1, Mc, Mc); None = the chain cannot switch
+    log_probs0: _Array  # (*batch|1, M1, ..., MC)
+    mean0: _Array  # (*batch|1, M1|1, ..., n)
+    cov0: _Array  # (*batch|1, M1|1, ..., n, n)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of states of each chain."""
+        return self.log_probs0.shape[self.log_probs0.ndim - len(self.trans) :]
+
+
+class _Reader:
+    """Reads arguments one by one against the shapes that z, trans and cov0 fix."""
+
+    def __init__(self, batch: tuple[int, ...], n_steps: int, sizes: tuple[int, ...]) -> None:
+        self.batch, self.n_steps, self.sizes = batch, n_steps, sizes
+
+    def model(self, name: str, value: npt.ArrayLike, core: tuple[int, ...]) -> _Array:
+        """Read a model array with trailing axes `core`: constant, time varying or per run."""
+        a = _finite(name, value)
+        n_modes, base = len(self.sizes), len(self.sizes) + len(core)
+        expected = f"(*{self.batch}, {self.n_steps}|1, {_modes(self.sizes)}{_axes(core)})"
+        if a.ndim < base:
+            raise ModelError(
+                f"{name} has shape {a.shape}; with {n_modes} chain(s) it is read from the right as {expected}, "
+                f"which needs at least {base} axes. A matrix common to all modes: "
+                f"{name}.reshape({(1,) * (base - len(core)) + a.shape[-len(core) :]})."
+            )
+        full = (*self.batch, self.n_steps, *self.sizes, *core)
+        return self._fit(name, a, full, expected, exact=len(core))
+
+    def prior(self, name: str, value: npt.ArrayLike, core: tuple[int, ...]) -> _Array:
+        """Read mean0 or cov0: shared, per mode, or per run."""
+        a = _finite(name, value)
+        n_modes = len(self.sizes)
+        expected = f"{core} shared, ({_modes(self.sizes)}{_axes(core)}) per mode, (*{self.batch}, ...) per run"
+        if a.ndim == len(core):
+            a = a.reshape((1,) * n_modes + a.shape)
+        if a.ndim < n_modes + len(core):
+            raise ModelError(
+                f"{name} has shape {a.shape}, which is none of: {expected}. "
+                f"Give one value per mode with an axis of length 1 for each chain it does not depend on."
+            )
+        return self._fit(name, a, (*self.batch, *self.sizes, *core), expected, exact=len(core))
+
+    def plain(self, name: str, value: npt.ArrayLike, core: tuple[int, ...], timed: bool) -> _Array:
+        """Read probs0 (core = sizes) or a transition matrix (core = (Mc, Mc), `timed`): no broadcast in core."""
+        a = _finite(name, value)
+        lead = (*self.batch, self.n_steps) if timed else self.batch
+        expected = f"{core}" + (f", ({self.n_steps}, {_axes(core)}) time varying" if timed else "") + " or per run"
+        if a.ndim < len(core):
+            raise ModelError(f"{name} has shape {a.shape}, expected {expected}.")
+        return self._fit(name, a, (*lead, *core), expected, exact=len(core))
+
+    def _fit(self, name: str, a: _Array, full: tuple[int, ...], expected: str, exact: int) -> _Array:
+        if a.ndim > len(full):
+            raise ModelError(f"{name} has {a.ndim} axes, {a.shape}, but is read as {expected}: drop leading axes.")
+        a = a.reshape((1,) * (len(full) - a.ndim) + a.shape)
+        loose = len(full) - exact
+        bad = [i for i in range(loose) if a.shape[i] not in (1, full[i])]
+        if bad or a.shape[loose:] != full[loose:]:
+            raise ModelError(
+                f"{name} has shape {a.shape[-max(1, len(a.shape)) :]} but is read from the right as {expected}. "
+                f"Reshape it so that absent axes have length 1."
+            )
+        return a
+
+
+def align(
+    z: npt.ArrayLike,
+    *,
+    F: npt.ArrayLike,
+    Q: npt.ArrayLike,
+    H: npt.ArrayLike,
+    R: npt.ArrayLike,
+    trans: Sequence[npt.ArrayLike],
+    mean0: npt.ArrayLike,
+    cov0: npt.ArrayLike,
+    probs0: npt.ArrayLike,
+    b: npt.ArrayLike | None,
+    d: npt.ArrayLike | None,
+) -> Aligned:
+    """Validate the arguments of a batch filter and give every array its full set of axes.
+
+    Raises:
+        ModelError: a shape that fits no reading, probabilities that are none, a covariance that is none.
+        DataError: inf in z, or NaN or inf elsewhere.
+    """
+    z_in = np.asarray(z, dtype=np.float64)
+    if z_in.ndim < 2 or z_in.shape[-2] == 0 or z_in.shape[-1] == 0:
+        raise DataError(f"z has shape {z_in.shape}; it is (*batch, T, m) with T and m at least 1.")
+    if np.isinf(z_in).any():
+        where = tuple(int(i) for i in np.argwhere(np.isinf(z_in))[0])
+        raise DataError(f"z{list(where)} is infinite. A missing component is NaN.")
+    seen = ~np.isnan(z_in)
+    m = z_in.shape[-1]
+    n = int(np.shape(cov0)[-1]) if np.ndim(cov0) >= 2 else 0
+    matrices = [np.asarray(t, dtype=np.float64) for t in trans]
+    for c, t in enumerate(matrices):
+        if t.ndim < 2 or t.shape[-1] != t.shape[-2] or t.shape[-1] == 0:
+            raise ModelError(f"trans[{c}] has shape {t.shape}; a transition matrix is square, (M, M).")
+    reader = _Reader(z_in.shape[:-2], z_in.shape[-2], tuple(t.shape[-1] for t in matrices))
+    return Aligned(
+        z=np.where(seen, z_in, 0.0),
+        seen=seen,
+        F=reader.model("F", F, (n, n)),
+        Q=_covariance("Q", reader.model("Q", Q, (n, n))),
+        H=reader.model("H", H, (m, n)),
+        R=_covariance("R", reader.model("R", R, (m, m))),
+        b=None if b is None else reader.model("b", b, (n,)),
+        d=None if d is None else reader.model("d", d, (m,)),
+        trans=tuple(_transition(c, reader.plain(f"trans[{c}]", t, t.shape[-2:], True)) for c, t in enumerate(matrices)),
+        log_probs0=_log_law("probs0", reader.plain("probs0", probs0, reader.sizes, False), len(matrices)),
+        mean0=reader.prior("mean0", mean0, (n,)),
+        cov0=_covariance("cov0", reader.prior("cov0", cov0, (n, n))),
+    )
+
+
+def _finite(name: str, value: npt.ArrayLike) -> _Array:
+    a = np.asarray(value, dtype=np.float64)
+    if not np.isfinite(a).all():
+        where = [int(i) for i in np.argwhere(~np.isfinite(a))[0]]
+        raise DataError(f"{name}{where} is {a[tuple(where)]}; only z may hold NaN (a missing component).")
+    return a
+
+
+def _covariance(name: str, a: _Array) -> _Array:
+    swapped = a.swapaxes(-1, -2)
+    scale = np.abs(a).max(axis=(-1, -2), keepdims=True, initial=0.0)
+    if (np.abs(a - swapped) > 1e-8 * scale).any():
+        where = [int(i) for i in np.argwhere(np.abs(a - swapped) > 1e-8 * scale)[0]]
+        raise ModelError(f"{name} is not symmetric at index {where}. A covariance equals its transpose.")
+    a = 0.5 * (a + swapped)
+    diagonal = np.diagonal(a, axis1=-2, axis2=-1)
+    negative = (diagonal < 0).any()
+    if not negative and a.size // max(1, a.shape[-1] ** 2) <= _MAX_EIGEN_CHECKS:
+        negative = (np.linalg.eigvalsh(a) < -1e-9 * scale[..., 0]).any()
+    if negative:
+        raise ModelError(f"{name} is not positive semidefinite. Give covariances, never factors or precisions.")
+    return a
+
+
+def _transition(c: int, t: _Array) -> _Array | None:
+    sums = t.sum(-1)
+    if (t < 0).any() or (np.abs(sums - 1.0) > 1e-6).any():
+        off = np.abs(sums - 1.0)
+        row = [int(i) for i in np.argwhere(off == off.max())[0]]
+        raise ModelError(
+            f"trans[{c}] rows must be probabilities that sum to 1: row {row[-1]} sums to {sums[tuple(row)]:.6g}. "
+            "Give probabilities *from* each state: trans[i, j] = P(next = j | now = i)."
+        )
+    return None if (t == np.eye(t.shape[-1])).all() else t
+
+
+def _log_law(name: str, p: _Array, n_chains: int) -> _Array:
+    axes = tuple(range(p.ndim - n_chains, p.ndim))
+    total = p.sum(axis=axes, keepdims=True)
+    if (p < 0).any() or (np.abs(total - 1.0) > 1e-6).any():
+        raise ModelError(f"{name} must be probabilities that sum to 1 over all modes; a sum is {total.ravel()[0]:.6g}.")
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(p / total))
+
+
+def _axes(core: tuple[int, ...]) -> str:
+    return ", ".join(str(s) for s in core)
+
+
+def _modes(sizes: tuple[int, ...]) -> str:
+    return "".join(f"{s}|1, " for s in sizes)

@@ -1,0 +1,68 @@
+"""The history a filter returns."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from saltus.errors import ModelError
+
+__all__ = ["Estimates"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimates:
+    """What was believed after each measurement, one row per measurement time.
+
+    `C` chains of sizes M1 ... MC, `*batch` leading axes, T rows, n states.
+
+    Attributes:
+        probs: P(modes | z_1..z_k), (*batch, T, M1, ..., MC).
+        mean: E[x_k | z_1..z_k], (*batch, T, n).
+        cov: its covariance, spread of the modes included, (*batch, T, n, n).
+        log_likelihood: log f(z_k | z_1..z_{k-1}) in nats, (*batch, T); 0 for a row without measurement. With
+            keep="last" it still has every row.
+        log_likelihood_start: log f of what the start was conditioned on, (*batch,); 0 where there is no such thing.
+        nis: nu' S^-1 nu of the mixture's innovation, (*batch, T); chi-square with n_observed degrees of freedom
+            when the model is right and one mode dominates.
+        n_observed: number of components measured, (*batch, T).
+        mode_means, mode_covs: per mode, (*batch, T, M1, ..., MC, n[, n]); None unless per_mode.
+        error: the filter's own error estimate (reference filters), else None.
+        chains: names of the chains, in axis order.
+        times: times of the rows in s, or None.
+    """
+
+    probs: Float[np.ndarray, "*modes"]
+    mean: Float[np.ndarray, "*rows n"]
+    cov: Float[np.ndarray, "*rows n n"]
+    log_likelihood: Float[np.ndarray, "*all_rows"]
+    log_likelihood_start: Float[np.ndarray, "*batch"]
+    nis: Float[np.ndarray, "*rows"]
+    n_observed: Float[np.ndarray, "*rows"]
+    mode_means: Float[np.ndarray, "*modes n"] | None = None
+    mode_covs: Float[np.ndarray, "*modes n n"] | None = None
+    error: Float[np.ndarray, "*rows"] | None = None
+    chains: tuple[str, ...] = ()
+    times: Float[np.ndarray, " t"] | None = None
+
+    def prob(self, chain: str | int) -> Float[np.ndarray, "*rows m"]:
+        """Return the marginal probabilities of one chain, (*batch, T, M).
+
+        Args:
+            chain: its name, or its position among the chains.
+
+        Raises:
+            ModelError: no chain of that name.
+        """
+        n_chains = self.probs.ndim - self.mean.ndim + 1
+        if isinstance(chain, str):
+            if chain not in self.chains:
+                raise ModelError(f"no chain named {chain!r}; the chains are {', '.join(self.chains) or 'unnamed'}.")
+            index = self.chains.index(chain)
+        else:
+            index = chain
+        if not 0 <= index < n_chains:
+            raise ModelError(f"chain {index} does not exist: there are {n_chains}, counted from 0.")
+        first = self.mean.ndim - 1
+        others = tuple(first + c for c in range(n_chains) if c != index)
+        return np.asarray(self.probs.sum(axis=others))

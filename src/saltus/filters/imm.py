@@ -1,0 +1,143 @@
+"""The multimode filter over arrays: the recursion of `steps` along time, vectorised over every leading axis."""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.errors import ModelError
+from saltus.filters import steps
+from saltus.filters.align import Aligned, align
+from saltus.filters.estimates import Estimates
+
+__all__ = ["imm_filter"]
+
+_Array = npt.NDArray[np.float64]
+
+
+def imm_filter(
+    z: npt.ArrayLike,
+    *,
+    F: npt.ArrayLike,
+    Q: npt.ArrayLike,
+    H: npt.ArrayLike,
+    R: npt.ArrayLike,
+    trans: Sequence[npt.ArrayLike],
+    mean0: npt.ArrayLike,
+    cov0: npt.ArrayLike,
+    probs0: npt.ArrayLike,
+    b: npt.ArrayLike | None = None,
+    d: npt.ArrayLike | None = None,
+    per_mode: bool = False,
+    keep: Literal["all", "last"] = "all",
+    backend: Literal["numpy"] | None = None,
+    num_threads: int | None = None,
+) -> Estimates:
+    """Filter measurements of a system whose matrices depend on hidden Markov chains.
+
+    x_k = F x_{k-1} + b + w,   z_k = H x_k + d + v,   cov w = Q, cov v = R,   mode at k applies to (t_{k-1}, t_k]:
+    mix, propagate, measure, condition, reweigh (fusion notes, section 4). With `trans=[]` it is the Kalman filter.
+
+    Shapes are read from the right, C = len(trans): model arrays are (*batch, T|1, M1|1, ..., MC|1, rows, cols).
+    Leading axes may be absent: ndim C+2 (C+1 for b, d) is constant, one more time varying, more is per run.
+
+    Args:
+        z: measurements, (*batch, T, m); NaN is a missing component.
+        F: transition matrices, (..., n, n), over (t_{k-1}, t_k].
+        Q: process noise covariances, (..., n, n).
+        H: measurement matrices, (..., m, n).
+        R: measurement noise covariances, (..., m, m).
+        trans: one matrix per chain, trans[c][i, j] = P(next = j | now = i); (Mc, Mc), (T, Mc, Mc) or per run.
+        mean0: prior mean one interval *before* z[0]; (n,), per mode (M1|1, ..., n), or per run.
+        cov0: its covariance; (n, n), per mode, or per run.
+        probs0: prior law of the modes, (M1, ..., MC), or per run; sums to 1.
+        b: known input, (..., n).
+        d: known measurement offset, (..., m).
+        per_mode: also return every mode's mean and covariance.
+        keep: "all" rows, or the "last" row only (T axis of length 1) with the log-likelihood of every row.
+        backend: "numpy" for this definition; None chooses.
+        num_threads: threads for a compiled backend.
+
+    Returns:
+        Estimates with rows at the times of z.
+
+    Raises:
+        ModelError: a shape or a law that cannot be; the message says how it was read and how to mend it.
+        DataError: inf in z, NaN or inf elsewhere.
+        NumericalError: an innovation covariance is not positive definite.
+
+    Source: Detkov (2023), equations 3.1-3.15 as corrected in the fusion notes; Blom and Bar-Shalom (1988).
+    """
+    if keep not in ("all", "last"):
+        raise ModelError(f'keep is "all" or "last", not {keep!r}.')
+    if backend not in (None, "numpy"):
+        raise ModelError(f'backend is None or "numpy", not {backend!r}.')
+    del num_threads
+    model = align(z, F=F, Q=Q, H=H, R=R, trans=trans, mean0=mean0, cov0=cov0, probs0=probs0, b=b, d=d)
+    return _filter(model, per_mode=per_mode, every=keep == "all")
+
+
+def _filter(model: Aligned, *, per_mode: bool, every: bool) -> Estimates:
+    n_chains, n_steps = len(model.trans), model.z.shape[-2]
+    batch, sizes, n = model.z.shape[:-2], model.sizes, model.cov0.shape[-1]
+    lead = (*batch, *sizes)
+    belief = steps.Belief(
+        np.broadcast_to(model.log_probs0, lead),
+        np.broadcast_to(model.mean0, (*lead, n)),
+        np.broadcast_to(model.cov0, (*lead, n, n)),
+    )
+    kept = n_steps if every else 1
+    mean, cov = np.empty((*batch, kept, n)), np.empty((*batch, kept, n, n))
+    log_probs, nis = np.empty((*batch, kept, *sizes)), np.empty((*batch, kept))
+    mode_means = np.empty((*batch, kept, *sizes, n)) if per_mode else None
+    mode_covs = np.empty((*batch, kept, *sizes, n, n)) if per_mode else None
+    log_likelihood = np.empty((*batch, n_steps))
+    rows: tuple[slice, ...] = (slice(None),) * len(batch)
+    for k in range(n_steps):
+        belief, log_f, d2 = _step(model, belief, k, n_chains, want_nis=every or k == n_steps - 1)
+        log_likelihood[(*rows, k)] = log_f
+        if every or k == n_steps - 1:
+            at = (*rows, k if every else 0)
+            mean[at], cov[at] = steps.collapse(*belief, n_chains)
+            log_probs[at], nis[at] = belief.log_probs, d2
+            if mode_means is not None and mode_covs is not None:
+                mode_means[at], mode_covs[at] = belief.means, belief.covs
+    n_observed = model.seen.sum(-1).astype(float)
+    return Estimates(
+        probs=np.exp(log_probs),
+        mean=mean,
+        cov=cov,
+        log_likelihood=log_likelihood,
+        log_likelihood_start=np.zeros(batch),
+        nis=nis,
+        n_observed=n_observed if every else n_observed[..., -1:],
+        mode_means=mode_means,
+        mode_covs=mode_covs,
+    )
+
+
+def _step(
+    model: Aligned, belief: steps.Belief, k: int, n_chains: int, want_nis: bool
+) -> tuple[steps.Belief, _Array, _Array | float]:
+    n_batch = model.z.ndim - 2
+
+    def at(a: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return np.take(a, k if a.shape[n_batch] > 1 else 0, axis=n_batch)
+
+    def per_mode(a: _Array) -> _Array:
+        return a.reshape(a.shape[:-1] + (1,) * n_chains + a.shape[-1:])
+
+    trans = [None if t is None else at(t) for t in model.trans]
+    log_probs, means, covs = steps.mix(*belief, trans)
+    means, covs = steps.propagate(means, covs, at(model.F), None if model.b is None else at(model.b), at(model.Q))
+    seen = at(model.seen)
+    if not seen.any():
+        zero = np.zeros(model.z.shape[:-2])
+        return steps.Belief(log_probs, means, covs), zero, zero
+    prediction = steps.measure(means, covs, at(model.H), None if model.d is None else at(model.d), at(model.R))
+    z, on = per_mode(at(model.z)), per_mode(seen)
+    done = steps.condition(prediction, z, on)
+    d2 = steps.mixture_nis(log_probs, prediction, at(model.z), seen, n_chains) if want_nis else 0.0
+    log_probs, log_f = steps.reweigh(log_probs, done.loglik, n_chains)
+    return steps.Belief(log_probs, done.mean, done.cov), log_f, d2
