@@ -14,6 +14,7 @@ from saltus.filters.estimates import Estimates
 __all__ = ["imm_filter"]
 
 _Array = npt.NDArray[np.float64]
+_Index = tuple[slice | int, ...]
 
 
 def imm_filter(
@@ -96,9 +97,9 @@ def _filter(model: Aligned, *, per_mode: bool, every: bool) -> Estimates:
     rows: tuple[slice, ...] = (slice(None),) * len(batch)
     for k in range(n_steps):
         belief, log_f, d2 = _step(model, belief, k, n_chains, want_nis=every or k == n_steps - 1)
-        log_likelihood[(*rows, k)] = log_f
+        log_likelihood[..., k] = log_f
         if every or k == n_steps - 1:
-            at = (*rows, k if every else 0)
+            at: _Index = (*rows, k if every else 0)
             mean[at], cov[at] = steps.collapse(*belief, n_chains)
             log_probs[at], nis[at] = belief.log_probs, d2
             if mode_means is not None and mode_covs is not None:
@@ -123,7 +124,7 @@ def _step(
     n_batch = model.z.ndim - 2
 
     def at(a: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return np.take(a, k if a.shape[n_batch] > 1 else 0, axis=n_batch)
+        return np.asarray(np.take(a, k if a.shape[n_batch] > 1 else 0, axis=n_batch))
 
     def per_mode(a: _Array) -> _Array:
         return a.reshape(a.shape[:-1] + (1,) * n_chains + a.shape[-1:])
