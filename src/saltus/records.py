@@ -6,7 +6,7 @@ north, clockwise. Readers convert once, in float64, whatever the precision of th
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Self
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -76,8 +76,8 @@ class Source:
     time_lsb: float = 0.0
 
 
-def _column(dtype: npt.DTypeLike, absent: object) -> npt.NDArray:  # type: ignore[type-arg]  # dtype differs
-    return field(metadata={"dtype": np.dtype(dtype), "absent": absent})  # type: ignore[no-any-return]  # a dataclass field
+def _column(dtype: npt.DTypeLike, absent: object) -> Any:
+    return field(metadata={"dtype": np.dtype(dtype), "absent": absent})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,7 +101,7 @@ class Plots:
     altitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m; pressure altitude if from Mode C
     icao24: npt.NDArray[np.int32] = _column(np.int32, -1)
     mode3a: npt.NDArray[np.int16] = _column(np.int16, -1)  # the 12 bits, shown in octal
-    callsign: npt.NDArray[np.str_] = _column("U8", "")
+    callsign: npt.NDArray[Any] = _column("U8", "")  # text of up to 8 characters
     on_ground: npt.NDArray[np.int8] = _column(np.int8, -1)  # 1 ground, 0 airborne, -1 not said
     local_id: npt.NDArray[np.int32] = _column(np.int32, -1)  # the source's own track number
     reason: npt.NDArray[np.int8] = _column(np.int8, 0)  # index into REASONS; 0 = usable
@@ -109,7 +109,7 @@ class Plots:
     @classmethod
     def build(
         cls, n: int, sources: tuple[Source, ...], files: tuple[str, ...], columns: Mapping[str, npt.ArrayLike]
-    ) -> Self:
+    ) -> "Plots":
         """Make `n` reports from the columns given; the others hold their absent value.
 
         Columns are converted to the class's types (so float32 input becomes float64 here, before any geometry).
@@ -132,7 +132,7 @@ class Plots:
         """Number of reports."""
         return len(self.time)
 
-    def take(self, index: npt.NDArray[np.generic] | slice) -> Self:
+    def take(self, index: npt.NDArray[np.generic] | slice) -> "Plots":
         """Return the reports selected by an index array, a mask or a slice."""
         return replace(self, **{name: getattr(self, name)[index] for name in self.column_names()})
 
@@ -142,7 +142,7 @@ class Plots:
         return [f.name for f in fields(cls) if f.name not in ("sources", "files")]
 
     @classmethod
-    def concat(cls, parts: list[Self]) -> Self:
+    def concat(cls, parts: list["Plots"]) -> "Plots":
         """Join reports of several files; equal systems become one source."""
         sources: list[Source] = []
         files: list[str] = []
@@ -159,7 +159,7 @@ class Plots:
             return cls.build(0, (), (), {})
         return cls.build(n, tuple(sources), tuple(files), {k: np.concatenate(v) for k, v in columns.items()})
 
-    def sorted_by_time(self) -> Self:
+    def sorted_by_time(self) -> "Plots":
         """Return the reports in time order (stable)."""
         return self.take(np.argsort(self.time, kind="stable"))
 
