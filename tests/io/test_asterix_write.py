@@ -46,7 +46,7 @@ def test_markers_and_sectors_frame_the_plots(tmp_path):
         data = data[length:]
     assert [category for category, _ in seen] == [34, 48, 34, 34]
     # FSPEC 010 000 030 - 041: e8; message 1; 100 s x 128 = 12800; period 4 s x 128 = 512
-    assert seen[0][1] == "22000b" + "e8" + "0102" + "01" + "003200" + "0200"
+    assert seen[0][1] == "22000c" + "e8" + "0102" + "01" + "003200" + "0200"
     # FSPEC 010 000 030 020: f0; message 2; 102 s x 128 = 13056; half a turn = 128
     assert seen[2][1] == "22000b" + "f0" + "0102" + "02" + "003300" + "80"
 
