@@ -8,7 +8,7 @@ __all__ = ["gaussian_terms", "logsumexp", "quadratic_form", "symmetric"]
 
 def symmetric(a: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
     """Return (A + A') / 2."""
-    return 0.5 * (a + a.swapaxes(-1, -2))
+    return np.asarray(0.5 * (a + a.swapaxes(-1, -2)))
 
 
 def quadratic_form(
@@ -26,7 +26,7 @@ def logsumexp(a: Float[np.ndarray, "*shape"], axes: tuple[int, ...]) -> Float[np
     top = np.max(a, axis=axes, keepdims=True, initial=-np.inf)
     shift = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
-        return np.log(np.sum(np.exp(a - shift), axis=axes, keepdims=True)) + shift
+        return np.asarray(np.log(np.sum(np.exp(a - shift), axis=axes, keepdims=True)) + shift)
 
 
 def gaussian_terms(
@@ -41,4 +41,4 @@ def gaussian_terms(
     L_inv = np.linalg.inv(L)
     white = (L_inv @ nu[..., None])[..., 0]
     logdet = 2.0 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
-    return np.sum(white * white, axis=-1), logdet, L_inv
+    return np.asarray(np.sum(white * white, axis=-1)), np.asarray(logdet), L_inv  # arrays without leading axes too

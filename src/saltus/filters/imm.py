@@ -126,7 +126,7 @@ def _step(
     def at(a: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return np.asarray(np.take(a, k if a.shape[n_batch] > 1 else 0, axis=n_batch))
 
-    def per_mode(a: _Array) -> _Array:
+    def per_mode(a: npt.NDArray[Any]) -> npt.NDArray[Any]:
         return a.reshape(a.shape[:-1] + (1,) * n_chains + a.shape[-1:])
 
     trans = [None if t is None else at(t) for t in model.trans]

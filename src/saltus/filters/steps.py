@@ -210,7 +210,7 @@ def condition(
     on_all = np.concatenate([np.ones((*on.shape[:-1], n)), on], axis=-1)
     N = N * (on_all[..., :, None] * on_all[..., None, :])
     cov = quadratic_form(A - K @ (C * on[..., None]), P) + quadratic_form(gain, N)
-    loglik = -0.5 * (d2 + logdet + _LOG_2PI * on.sum(-1))
+    loglik = np.asarray(-0.5 * (d2 + logdet + _LOG_2PI * on.sum(-1)))
     return Conditioned(mean + (K @ nu[..., None])[..., 0], cov, loglik, d2)
 
 
@@ -225,7 +225,7 @@ def reweigh(
     axes = tuple(range(log_probs.ndim - n_chains, log_probs.ndim))
     total = log_probs + loglik
     evidence = logsumexp(total, axes)
-    return total - evidence, evidence.reshape(evidence.shape[: evidence.ndim - n_chains])
+    return np.asarray(total - evidence), evidence.reshape(evidence.shape[: evidence.ndim - n_chains])
 
 
 def collapse(

@@ -1,0 +1,92 @@
+"""Random hybrid models: hypothesis draws structure and a seed, NumPy the numbers.
+
+Drawing every matrix element would shrink to zeros, where nothing can go wrong.
+"""
+
+import numpy as np
+from hypothesis import settings
+from hypothesis import strategies as st
+
+__all__ = ["law", "problems", "quick", "random_cov", "random_problem", "random_trans", "rngs"]
+
+# The same examples on every machine; a deadline would be a timing assertion.
+quick = settings(max_examples=25, deadline=None, derandomize=True)
+
+
+def rngs():
+    return st.integers(0, 2**32 - 1).map(np.random.default_rng)
+
+
+def random_cov(rng, lead, n):
+    """Well-conditioned covariances, (*lead, n, n)."""
+    a = rng.normal(size=(*lead, n, n))
+    return a @ a.swapaxes(-1, -2) / n + 0.2 * np.eye(n)
+
+
+def law(rng, lead, m):
+    """Probabilities over the last axis, none tiny."""
+    p = rng.uniform(0.1, 1.0, size=(*lead, m))
+    return p / p.sum(-1, keepdims=True)
+
+
+def random_trans(rng, m, lead=()):
+    """A transition matrix with distinct rows; its transpose is none."""
+    return 0.6 * np.eye(m) + 0.4 * law(rng, (*lead, m), m)
+
+
+def _lead(rng, batch, n_steps, sizes):
+    """Axes a model array may have: some chains, perhaps time, perhaps runs."""
+    modes = tuple(int(rng.choice([1, s])) for s in sizes)
+    kind = rng.integers(3 if batch else 2)
+    time = int(rng.choice([1, n_steps]))
+    return (modes, (n_steps, *modes), (*batch, time, *modes))[kind]
+
+
+def _prior_lead(rng, batch, sizes):
+    modes = tuple(int(rng.choice([1, s])) for s in sizes)
+    return ((), modes, (*batch, *modes))[rng.integers(3)]
+
+
+def random_problem(rng, sizes=(2,), n=2, m=1, n_steps=4, batch=(), missing=0.2):
+    """Arguments of `imm_filter` in which each array has its own axes, drawn at random."""
+
+    def lead():
+        return _lead(rng, batch, n_steps, sizes)
+
+    def transition(size):
+        kind = rng.integers(4 if batch else 3)
+        if kind == 0:
+            return random_trans(rng, size)
+        if kind == 1:
+            return np.eye(size)
+        return random_trans(rng, size, ((n_steps,), (*batch, int(rng.choice([1, n_steps]))))[kind - 2])
+
+    n_modes = int(np.prod(sizes))
+    probs_lead = batch if rng.random() < 0.5 else ()
+    z = 2.0 * rng.normal(size=(*batch, n_steps, m))
+    z[rng.random(z.shape) < missing] = np.nan
+    return {
+        "z": z,
+        "F": np.eye(n) + 0.3 * rng.normal(size=(*lead(), n, n)),
+        "Q": random_cov(rng, lead(), n),
+        "H": rng.normal(size=(*lead(), m, n)),
+        "R": random_cov(rng, lead(), m),
+        "trans": [transition(s) for s in sizes],
+        "mean0": rng.normal(size=(*_prior_lead(rng, batch, sizes), n)),
+        "cov0": random_cov(rng, _prior_lead(rng, batch, sizes), n),
+        "probs0": law(rng, probs_lead, n_modes).reshape(*probs_lead, *sizes),
+        "b": rng.normal(size=(*lead(), n)) if rng.random() < 0.5 else None,
+        "d": rng.normal(size=(*lead(), m)) if rng.random() < 0.5 else None,
+    }
+
+
+@st.composite
+def problems(draw, max_chains=3, max_modes=12, max_batch=2):
+    """Any number of chains and leading axes, missing components, time-varying and per-run arrays."""
+    sizes = tuple(draw(st.lists(st.integers(1, 3), min_size=0, max_size=max_chains)))
+    while np.prod(sizes) > max_modes:
+        sizes = sizes[:-1]
+    batch = tuple(draw(st.lists(st.integers(1, 3), min_size=0, max_size=max_batch)))
+    rng = draw(rngs())
+    n, m, n_steps = draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 5))
+    return random_problem(rng, sizes, n, m, n_steps, batch)
