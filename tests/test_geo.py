@@ -5,7 +5,7 @@ from decimal import Decimal, getcontext
 import numpy as np
 import pyproj
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from saltus import geo
@@ -38,6 +38,7 @@ def slant_and_azimuth(lat, lon, height, site):
 # --- angles, ellipsoid -------------------------------------------------------------------------------------
 
 
+@settings(deadline=None)  # nothing here is about time
 @given(st.floats(-1e4, 1e4))
 def test_wrap_is_the_same_angle_in_range(angle):
     wrapped = geo.wrap(angle)
@@ -381,6 +382,7 @@ def test_unknown_height_by_monte_carlo(r, rng):
     np.testing.assert_array_equal(out.cross[0], 0.0)
 
 
+@settings(deadline=None)  # nothing here is about time
 @given(
     r=st.floats(50.0, 470e3),
     beta=st.floats(0, 6.28),
