@@ -128,6 +128,17 @@ def test_polar_to_geodetic_inverts_proj_to_a_millimetre(latitude, rng):
     np.testing.assert_allclose(geo.wrap(azimuth_t - np.radians(back_azimuth) - np.pi), 0, atol=4e-4)
 
 
+def test_polar_coordinates_of_points_by_proj(rng):
+    lat, lon, height = rng.uniform(0.70, 0.74, 200), rng.uniform(0.01, 0.07, 200), rng.uniform(0, 15000, 200)
+    slant, azimuth, elevation = geo.geodetic_to_polar(lat, lon, height, BARCELONA)
+    expected_slant, expected_azimuth = slant_and_azimuth(lat, lon, height, BARCELONA)
+    np.testing.assert_allclose(slant, expected_slant, atol=1e-6)
+    np.testing.assert_allclose(geo.wrap(azimuth - expected_azimuth), 0, atol=1e-9)
+    up = ecef(BARCELONA.latitude, BARCELONA.longitude, 1e3) - ecef(BARCELONA.latitude, BARCELONA.longitude, 0.0)
+    ray = ecef(lat, lon, height) - ecef(BARCELONA.latitude, BARCELONA.longitude, BARCELONA.height)
+    np.testing.assert_allclose(np.sin(elevation), ray @ up / 1e3 / slant, atol=1e-9)
+
+
 def test_impossible_triangle_is_overhead():
     lat, lon, elevation, azimuth = geo.polar_to_geodetic(5000.0, 1.0, 9000.0, BARCELONA)
     assert GEOD.inv(*np.degrees([BARCELONA.longitude, BARCELONA.latitude, lon, lat]))[2] < 1e-6

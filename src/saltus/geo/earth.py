@@ -12,6 +12,7 @@ __all__ = [
     "Site",
     "ecef_to_geodetic",
     "geodetic_to_ecef",
+    "geodetic_to_polar",
     "local_basis",
     "polar_to_geodetic",
     "radius_of_curvature",
@@ -185,6 +186,19 @@ def polar_to_geodetic(
     # Straight up, the direction over the ground is the antenna's.
     azimuth_t = np.where(flat > 1e-9, np.arctan2(e, n) % (2.0 * np.pi), beta)
     return lat, lon, np.asarray(np.arctan2(u, flat)), azimuth_t
+
+
+def geodetic_to_polar(
+    latitude: npt.ArrayLike, longitude: npt.ArrayLike, height: npt.ArrayLike, site: Site
+) -> tuple[Float[np.ndarray, "*lead"], Float[np.ndarray, "*lead"], Float[np.ndarray, "*lead"]]:
+    """Slant range (m), azimuth ([0, 2 pi), from north, clockwise) and elevation (rad) of points seen from a site."""
+    offset = geodetic_to_ecef(latitude, longitude, height) - geodetic_to_ecef(
+        site.latitude, site.longitude, site.height
+    )
+    east, north, up = np.moveaxis(offset @ local_basis(site.latitude, site.longitude).T, -1, 0)
+    level = np.hypot(east, north)
+    azimuth = np.arctan2(east, north) % (2.0 * np.pi)
+    return np.asarray(np.hypot(level, up)), np.asarray(azimuth), np.asarray(np.arctan2(up, level))
 
 
 def _ray(level: npt.NDArray[np.float64], up: npt.NDArray[np.float64], sine: npt.ArrayLike) -> npt.NDArray[np.float64]:
