@@ -74,7 +74,7 @@ def random_problem(rng, sizes=(2,), n=2, m=1, n_steps=4, batch=(), missing=0.2):
         "trans": [transition(s) for s in sizes],
         "mean0": rng.normal(size=(*_prior_lead(rng, batch, sizes), n)),
         "cov0": random_cov(rng, _prior_lead(rng, batch, sizes), n),
-        "probs0": law(rng, probs_lead, n_modes).reshape(*probs_lead, *sizes),
+        "probs0": law(rng, probs_lead, n_modes).reshape((*probs_lead, *sizes)),
         "b": rng.normal(size=(*lead(), n)) if rng.random() < 0.5 else None,
         "d": rng.normal(size=(*lead(), m)) if rng.random() < 0.5 else None,
     }

@@ -10,6 +10,7 @@ equations 3.1-3.15, corrected); Blom and Bar-Shalom (1988) for the interacting m
 """
 
 from collections.abc import Sequence
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -223,7 +224,7 @@ def reweigh(
         log P(modes | z), normalised, and log f(z) = logsumexp(log P + loglik).
     """
     axes = tuple(range(log_probs.ndim - n_chains, log_probs.ndim))
-    total = log_probs + loglik
+    total = np.asarray(log_probs + loglik)
     evidence = logsumexp(total, axes)
     return np.asarray(total - evidence), evidence.reshape(evidence.shape[: evidence.ndim - n_chains])
 
@@ -237,11 +238,12 @@ def collapse(
     """Return mean and covariance of the mixture: sum P x and sum P [R + (x - mean)(x - mean)']."""
     lead = log_probs.shape[: log_probs.ndim - n_chains]
     n = means.shape[-1]
-    p = np.exp(log_probs).reshape((*lead, 1, -1))
-    x = means.reshape((*lead, -1, n))
+    n_modes = prod(log_probs.shape[len(lead) :])  # spelt out: -1 cannot be told where lead holds no run
+    p = np.exp(log_probs).reshape((*lead, 1, n_modes))
+    x = means.reshape((*lead, n_modes, n))
     mean = p @ x
     spread = x - mean
-    cov = (p @ covs.reshape((*lead, -1, n * n))).reshape((*lead, n, n))
+    cov = (p @ covs.reshape((*lead, n_modes, n * n))).reshape((*lead, n, n))
     cov = cov + (p.swapaxes(-1, -2) * spread).swapaxes(-1, -2) @ spread
     return mean[..., 0, :], symmetric(cov)
 

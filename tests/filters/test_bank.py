@@ -1,0 +1,164 @@
+"""Rows of a bank against the batch filter, and the book-keeping of rows."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from oracles import error
+from saltus.errors import ModelError
+from saltus.filters import Bank, Belief, imm_filter
+from strategies import quick, random_problem, rngs
+
+ROUND_OFF = 1e-11
+
+
+def start(problem, n_rows):
+    """The problem's prior as a Belief with one leading axis."""
+    sizes = tuple(t.shape[-1] for t in problem["trans"])
+    n = problem["cov0"].shape[-1]
+    return Belief(
+        np.log(np.broadcast_to(problem["probs0"], (n_rows, *sizes))),
+        np.broadcast_to(problem["mean0"], (n_rows, *sizes, n)),
+        np.broadcast_to(problem["cov0"], (n_rows, *sizes, n, n)),
+    )
+
+
+def at(problem, name, k):
+    """The matrix of row k: (rows, modes, ...) where it differs by row, (1, modes, ...) where it does not."""
+    a = problem[name]
+    if a is None:
+        return None
+    n_rows, m, n = len(problem["z"]), problem["z"].shape[-1], problem["cov0"].shape[-1]
+    sizes = tuple(t.shape[-1] for t in problem["trans"])
+    core = {"F": (n, n), "Q": (n, n), "H": (m, n), "R": (m, m), "b": (n,), "d": (m,)}[name]
+    a = a.reshape((1,) * (2 + len(sizes) + len(core) - a.ndim) + a.shape)
+    a = a[:, k if a.shape[1] > 1 else 0]
+    return np.broadcast_to(a, (n_rows, *sizes, *core)) if a.shape[0] > 1 else a
+
+
+def transitions(problem, k):
+    out = []
+    for t in problem["trans"]:
+        t = t.reshape((1,) * (4 - t.ndim) + t.shape)[:, k if t.ndim > 2 and t.shape[-3] > 1 else 0]
+        out.append(None if (t == np.eye(t.shape[-1])).all() else t if len(t) > 1 else t[0])
+    return out
+
+
+@quick
+@given(rngs(), st.lists(st.integers(1, 3), max_size=2), st.integers(1, 4), st.integers(1, 3))
+def test_bank_follows_the_batch_filter_row_by_row(rng, sizes, n_rows, n):
+    p = random_problem(rng, tuple(sizes), n=n, m=2, n_steps=4, batch=(n_rows,))
+    est = imm_filter(**p)
+    bank = Bank(n, tuple(sizes), capacity=1)
+    others = bank.add(start(p, n_rows))
+    rows = rng.permutation(bank.add(start(p, n_rows)))
+    bank.write(rows, start(p, n_rows))
+    before = bank.read(others)
+    for k in range(4):
+        bank.step(rows, transitions(p, k), at(p, "F", k), at(p, "b", k), at(p, "Q", k))
+        measurement = (p["z"][:, k], at(p, "H", k), at(p, "d", k), at(p, "R", k))
+        scored = bank.score(rows, *measurement)
+        d2, log_f = bank.update(rows, *measurement)
+        np.testing.assert_array_equal(scored, (d2, log_f))
+        mean, cov, probs = bank.moments(rows)
+        assert error(mean, est.mean[:, k]) < ROUND_OFF
+        assert error(cov, est.cov[:, k]) < ROUND_OFF
+        assert error(probs, est.probs[:, k]) < ROUND_OFF
+        np.testing.assert_allclose(log_f, est.log_likelihood[:, k], rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(d2, est.nis[:, k], rtol=1e-10, atol=1e-10)
+    for a, b in zip(before, bank.read(others), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def belief_of(value, n_rows=1, sizes=(2,), n=2):
+    """Recognisable rows: means value, value + 1, ..."""
+    means = np.broadcast_to(value + np.arange(n_rows).reshape(-1, *(1,) * (len(sizes) + 1)), (n_rows, *sizes, n))
+    covs = np.broadcast_to(np.eye(n), (n_rows, *sizes, n, n))
+    return Belief(np.full((n_rows, *sizes), -np.log(np.prod(sizes))), means.astype(float), covs)
+
+
+def values(bank, rows):
+    return bank.moments(rows)[0][:, 0].round(12).tolist()
+
+
+def test_rows_are_distinct_recycled_and_survive_growth():
+    bank = Bank(2, (2,), capacity=2)
+    first = bank.add(belief_of(10.0, 2))
+    assert len(bank) == 2
+    more = bank.add(belief_of(20.0, 20))  # grows more than once
+    assert len(bank) == 22 and len(set(first) | set(more)) == 22
+    assert values(bank, first) == [10.0, 11.0] and values(bank, more) == list(range(20, 40))
+    bank.remove(more[3:6])
+    assert len(bank) == 19
+    again = bank.add(belief_of(50.0, 3))
+    assert set(again) == set(more[3:6])
+    assert values(bank, again) == [50.0, 51.0, 52.0] and values(bank, more[:3]) == [20.0, 21.0, 22.0]
+
+
+def test_read_gives_copies():
+    bank = Bank(2, (2,))
+    rows = bank.add(belief_of(1.0))
+    bank.read(rows).means[...] = 7.0
+    assert values(bank, rows) == [1.0]
+
+
+def test_take_repeats_rows_in_a_bank_of_its_own_and_put_returns_them():
+    bank = Bank(2, (2,))
+    rows = bank.add(belief_of(10.0, 3))
+    copies = bank.take(rows[[2, 0, 2]])
+    assert len(copies) == 3 and values(copies, np.arange(3)) == [12.0, 10.0, 12.0]
+    copies.step(np.array([1]), [None], np.eye(2)[None, None], np.array([[[100.0, 0.0]]]), np.zeros((1, 1, 2, 2)))
+    assert values(copies, np.arange(3)) == [12.0, 110.0, 12.0]
+    assert values(bank, rows) == [10.0, 11.0, 12.0]
+    bank.put(rows[[0, 1]], copies, np.array([1, 2]))
+    assert values(bank, rows) == [110.0, 12.0, 12.0]
+    extra = copies.add(belief_of(5.0))  # a taken bank is an ordinary one: it grows
+    assert len(copies) == 4 and values(copies, extra) == [5.0] and values(copies, np.arange(3)) == [12.0, 110.0, 12.0]
+
+
+def test_score_of_many_plots_against_few_rows(rng):
+    p = random_problem(rng, (2,), n=3, m=2, n_steps=1, batch=(2,), missing=0.0)
+    bank = Bank(3, (2,))
+    rows = bank.add(start(p, 2))
+    H, R = rng.normal(size=(1, 1, 2, 3)), np.eye(2)[None, None]
+    pairs, z = rows[[0, 1, 0, 0]], rng.normal(size=(4, 2))
+    z[3, 1] = np.nan
+    before = bank.read(rows)
+    d2, log_f = bank.score(pairs, z, H, None, R)
+    for i, row in enumerate(pairs):
+        one = bank.take(np.array([row]))
+        got = one.update(np.array([0]), z[i : i + 1], H, None, R)
+        assert abs(got[0][0] - d2[i]) < 1e-10 * (1 + d2[i]) and abs(got[1][0] - log_f[i]) < 1e-10 * (1 + abs(log_f[i]))
+    for a, b in zip(before, bank.read(rows), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_measurement_with_nothing_seen_changes_nothing(rng):
+    bank = Bank(2, (2,))
+    rows = bank.add(belief_of(3.0, 2))
+    before = bank.read(rows)
+    d2, log_f = bank.update(rows, np.full((2, 1), np.nan), np.ones((1, 1, 1, 2)), None, np.ones((1, 1, 1, 1)))
+    assert (np.abs(d2) < 1e-12).all() and (np.abs(log_f) < 1e-12).all()
+    for a, b in zip(before, bank.read(rows), strict=True):
+        np.testing.assert_allclose(b, a, rtol=1e-15, atol=1e-15)
+
+
+@pytest.mark.parametrize("sizes", [(), (2, 3)])
+def test_no_rows_at_all(sizes):
+    bank, none = Bank(2, sizes), np.array([], dtype=np.intp)
+    one = (1,) * len(sizes)
+    F, H, R = np.eye(2).reshape(1, *one, 2, 2), np.ones((1, *one, 1, 2)), np.ones((1, *one, 1, 1))
+    assert bank.add(belief_of(0.0, 0, sizes)).shape == (0,) and len(bank) == 0
+    bank.step(none, [np.eye(s) for s in sizes], F, None, F)
+    for d2, log_f in (bank.score(none, np.zeros((0, 1)), H, None, R), bank.update(none, np.zeros((0, 1)), H, None, R)):
+        assert d2.shape == (0,) and log_f.shape == (0,)
+    mean, cov, probs = bank.moments(none)
+    assert mean.shape == (0, 2) and cov.shape == (0, 2, 2) and probs.shape == (0, *sizes)
+    assert len(bank.take(none)) == 0
+
+
+@pytest.mark.parametrize(("n", "sizes"), [(0, (2,)), (2, (2, 0))])
+def test_impossible_bank(n, sizes):
+    with pytest.raises(ModelError, match="a Bank needs n >= 1 and chains of at least one state"):
+        Bank(n, sizes)
