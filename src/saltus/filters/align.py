@@ -125,7 +125,9 @@ def align(
         raise DataError(f"z{list(where)} is infinite. A missing component is NaN.")
     seen = ~np.isnan(z_in)
     m = z_in.shape[-1]
-    n = int(np.shape(cov0)[-1]) if np.ndim(cov0) >= 2 else 0
+    if np.ndim(cov0) < 2:
+        raise ModelError(f"cov0 has shape {np.shape(cov0)}; it is a covariance matrix, (n, n), per mode or per run.")
+    n = int(np.shape(cov0)[-1])
     matrices = [np.asarray(t, dtype=np.float64) for t in trans]
     for c, t in enumerate(matrices):
         if t.ndim < 2 or t.shape[-1] != t.shape[-2] or t.shape[-1] == 0:
@@ -173,21 +175,30 @@ def _covariance(name: str, a: _Array) -> _Array:
 
 def _transition(c: int, t: _Array) -> _Array | None:
     sums = t.sum(-1)
-    if (t < 0).any() or (np.abs(sums - 1.0) > 1e-6).any():
+    if (t < 0).any():
+        where = [int(i) for i in np.argwhere(t < 0)[0]]
+        raise ModelError(f"trans[{c}]{where} is {t[tuple(where)]:.6g}; a probability is at least 0.")
+    if (np.abs(sums - 1.0) > 1e-6).any():
         off = np.abs(sums - 1.0)
         row = [int(i) for i in np.argwhere(off == off.max())[0]]
         raise ModelError(
             f"trans[{c}] rows must be probabilities that sum to 1: row {row[-1]} sums to {sums[tuple(row)]:.6g}. "
             "Give probabilities *from* each state: trans[i, j] = P(next = j | now = i)."
         )
-    return None if (t == np.eye(t.shape[-1])).all() else t
+    # Rows are made to sum to 1 to the last bit, or rounding in the caller's matrix would grow with every empty row.
+    return None if (t == np.eye(t.shape[-1])).all() else t / sums[..., None]
 
 
 def _log_law(name: str, p: _Array, n_chains: int) -> _Array:
     axes = tuple(range(p.ndim - n_chains, p.ndim))
     total = p.sum(axis=axes, keepdims=True)
-    if (p < 0).any() or (np.abs(total - 1.0) > 1e-6).any():
-        raise ModelError(f"{name} must be probabilities that sum to 1 over all modes; a sum is {total.ravel()[0]:.6g}.")
+    if (p < 0).any():
+        raise ModelError(f"{name} holds {p.min():.6g}; a probability is at least 0.")
+    off = np.abs(total - 1.0)
+    if (off > 1e-6).any():
+        raise ModelError(
+            f"{name} must be probabilities that sum to 1 over all modes; a sum is {total.flat[off.argmax()]:.6g}."
+        )
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(p / total))
 
