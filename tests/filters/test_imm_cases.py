@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from oracles import error
 
+from oracles import error
 from saltus.filters import Belief, imm_filter, steps
 
 # The definition, and whatever the package chooses by itself where a compiled backend is present.

@@ -1,6 +1,7 @@
 """The multimode filter over arrays: the recursion of `steps` along time, vectorised over every leading axis."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -121,24 +122,21 @@ def _filter(model: Aligned, *, per_mode: bool, every: bool) -> Estimates:
 def _step(
     model: Aligned, belief: steps.Belief, k: int, n_chains: int, want_nis: bool
 ) -> tuple[steps.Belief, _Array, _Array | float]:
-    n_batch = model.z.ndim - 2
-
-    def at(a: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return np.asarray(np.take(a, k if a.shape[n_batch] > 1 else 0, axis=n_batch))
-
-    def per_mode(a: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        return a.reshape(a.shape[:-1] + (1,) * n_chains + a.shape[-1:])
-
+    at = partial(_row, k, model.z.ndim - 2)
     trans = [None if t is None else at(t) for t in model.trans]
     log_probs, means, covs = steps.mix(*belief, trans)
     means, covs = steps.propagate(means, covs, at(model.F), None if model.b is None else at(model.b), at(model.Q))
-    seen = at(model.seen)
+    z, seen = at(model.z), at(model.seen)
     if not seen.any():
         zero = np.zeros(model.z.shape[:-2])
         return steps.Belief(log_probs, means, covs), zero, zero
     prediction = steps.measure(means, covs, at(model.H), None if model.d is None else at(model.d), at(model.R))
-    z, on = per_mode(at(model.z)), per_mode(seen)
-    done = steps.condition(prediction, z, on)
-    d2 = steps.mixture_nis(log_probs, prediction, at(model.z), seen, n_chains) if want_nis else 0.0
+    per_mode = z.shape[:-1] + (1,) * n_chains + z.shape[-1:]
+    done = steps.condition(prediction, z.reshape(per_mode), seen.reshape(per_mode))
+    d2 = steps.mixture_nis(log_probs, prediction, z, seen, n_chains) if want_nis else 0.0
     log_probs, log_f = steps.reweigh(log_probs, done.loglik, n_chains)
     return steps.Belief(log_probs, done.mean, done.cov), log_f, d2
+
+
+def _row(k: int, axis: int, a: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    return np.asarray(np.take(a, k if a.shape[axis] > 1 else 0, axis=axis))
