@@ -1,0 +1,111 @@
+"""Checks that descriptions share: finite numbers, covariances, intervals, equality by value."""
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.errors import ModelError
+
+__all__ = ["FloatArray", "covariance", "intervals", "numbers", "same", "unit_steps"]
+
+FloatArray: TypeAlias = npt.NDArray[np.float64]
+
+_EQUAL_INTERVALS = 1e-3  # relative: clocks are quantised, a step is still a step
+
+
+def numbers(value: object, what: str) -> FloatArray:
+    """Copy a value into a read-only float64 array of finite numbers.
+
+    Raises:
+        ModelError: `what` is ragged, not real numbers, or holds NaN or inf.
+    """
+    try:
+        array = np.array(value)
+    except ValueError as error:
+        raise ModelError(f"{what} is not an array: its rows differ in length ({error}).") from None
+    if array.dtype.kind not in "biuf":
+        raise ModelError(f"{what} must be real numbers, got {value!r}.")
+    array = array.astype(np.float64)
+    bad = np.argwhere(~np.isfinite(array))
+    if len(bad):
+        index = tuple(int(i) for i in bad[0])
+        raise ModelError(f"{what} holds {array[index]} at index {list(index)}; give a finite number.")
+    array.flags.writeable = False
+    return array
+
+
+def covariance(value: object, what: str) -> FloatArray:
+    """Check covariances (..., n, n): symmetric and positive semi-definite, judged in units of their own diagonal.
+
+    Raises:
+        ModelError: not square, not symmetric, or a negative eigenvalue.
+    """
+    array = numbers(value, what)
+    if array.ndim < 2 or array.shape[-1] != array.shape[-2]:
+        raise ModelError(
+            f"{what} must be a covariance matrix (n, n), got shape {array.shape}.\n"
+            "Pass variances on the diagonal: np.diag(sigma**2)."
+        )
+    variance = np.diagonal(array, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where(variance > 0, variance, 1.0))
+    scaled = array / (scale[..., :, None] * scale[..., None, :])
+    skew = np.abs(scaled - np.swapaxes(scaled, -1, -2))
+    if array.size and skew.max() > 1e-8:
+        i, j = np.unravel_index(int(skew.argmax()), skew.shape)[-2:]
+        raise ModelError(
+            f"{what} must be symmetric: entries [{i}, {j}] and [{j}, {i}] differ.\nSymmetrise it: (P + P.T) / 2."
+        )
+    if array.size and np.linalg.eigvalsh(scaled).min() < -1e-8:
+        smallest = np.linalg.eigvalsh((array + np.swapaxes(array, -1, -2)) / 2).min()
+        raise ModelError(
+            f"{what} must be positive semi-definite: its smallest eigenvalue is {smallest:.6g}.\n"
+            "Check signs, and that correlations stay within [-1, 1]."
+        )
+    array = (array + np.swapaxes(array, -1, -2)) / 2
+    array.flags.writeable = False
+    return array
+
+
+def intervals(dt: object, what: str = "dt") -> FloatArray:
+    """Check intervals in seconds: finite, not negative.
+
+    Raises:
+        ModelError: an interval is negative or not finite.
+    """
+    array = numbers(dt, what)
+    if array.size and array.min() < 0:
+        raise ModelError(f"{what} must not be negative, got {array.min():g} s. Sort measurements by time.")
+    return array
+
+
+def unit_steps(dt: FloatArray, what: str, remedy: str) -> npt.NDArray[np.int64]:
+    """Count steps for a description that is per step: 0 where dt is 0, 1 elsewhere.
+
+    Raises:
+        ModelError: the positive intervals differ by more than 0.1 %.
+    """
+    positive = dt[dt > 0]
+    if positive.size and positive.max() - positive.min() > _EQUAL_INTERVALS * positive.max():
+        raise ModelError(
+            f"{what} is per step and needs equal intervals, "
+            f"but they range from {positive.min():g} to {positive.max():g} s.\n{remedy}"
+        )
+    return np.asarray(dt > 0, dtype=np.int64)
+
+
+def same(a: object, b: object) -> bool:
+    """Compare two descriptions by value, arrays included."""
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return bool(np.array_equal(a, b))
+    if is_dataclass(a) and not isinstance(a, type):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return bool(a == b)

@@ -1,0 +1,261 @@
+"""Motion along each axis of space, with closed forms over any interval: constant velocity, acceleration, Singer.
+
+State order: the axes one after another, per axis position, velocity (, acceleration): (x, vx, y, vy).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import factorial
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from saltus.errors import ModelError
+from saltus.models.chain import Chain
+from saltus.models.checks import FloatArray, intervals, numbers, same
+from saltus.models.dependence import Matrix, fixed, is_fixed, resolve
+from saltus.models.dynamics import LinearSDE, Step
+
+__all__ = ["Motion", "constant_acceleration", "constant_velocity", "singer"]
+
+
+def constant_velocity(dims: int, accel: Matrix, kind: Literal["scan", "white"] = "scan") -> "Motion":
+    """Constant velocity, disturbed by acceleration; state (x, vx) per axis.
+
+    F = [[1, dt], [0, 1]];
+    "scan": Q = accel^2 g g', g = (dt^2/2, dt): acceleration constant within an interval, independent between them;
+    "white": Q = accel [[dt^3/3, dt^2/2], [dt^2/2, dt]]: white acceleration, consistent over divided intervals.
+
+    Args:
+        dims: number of axes.
+        accel: for all axes or per axis (dims,), and possibly depending on chains: "scan", standard deviation in
+            m/s^2; "white", spectral density in m^2/s^3 (accel_scan^2 * scan_period matches at that period).
+        kind: the law of the acceleration.
+
+    Raises:
+        ModelError: accel is negative, or does not fit the number of axes.
+
+    Source: Zhuk, Kozheshkurt and Yuzefovich (2009), horizontal and vertical models, for "scan".
+    """
+    if kind not in ("scan", "white"):
+        raise ModelError(f"constant_velocity: kind must be 'scan' or 'white', got {kind!r}.")
+    return Motion("velocity-scan" if kind == "scan" else "velocity-white", dims, accel)
+
+
+def constant_acceleration(dims: int, jerk: Matrix) -> "Motion":
+    """Constant acceleration, disturbed by white jerk; state (x, vx, ax) per axis.
+
+    F = [[1, dt, dt^2/2], [0, 1, dt], [0, 0, 1]],  Q = jerk int_0^dt f f' ds,  f = (s^2/2, s, 1)
+
+    Args:
+        dims: number of axes.
+        jerk: spectral density, m^2/s^5, for all axes or per axis (dims,), possibly depending on chains.
+
+    Raises:
+        ModelError: jerk is negative, or does not fit the number of axes.
+    """
+    return Motion("acceleration", dims, jerk)
+
+
+def singer(dims: int, tau: Matrix, sigma: Matrix) -> "Motion":
+    """Exponentially correlated acceleration; state (x, vx, ax) per axis.
+
+    da = -a/tau dt + sigma sqrt(2/tau) dW: stationary, E a(t) a(t+s) = sigma^2 exp(-|s|/tau)
+
+    Args:
+        dims: number of axes.
+        tau: correlation time, s, for all axes or per axis (dims,), possibly depending on chains.
+        sigma: standard deviation of the acceleration, m/s^2, likewise.
+
+    Raises:
+        ModelError: tau is not positive, sigma negative, or they do not fit the number of axes.
+
+    Source: Singer (1970); its covariance integrated anew, as power series where the closed form cancels.
+    """
+    return Motion("singer", dims, sigma, tau)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """One law of motion for each of `dims` axes; made by constant_velocity, constant_acceleration or singer."""
+
+    law: Literal["velocity-scan", "velocity-white", "acceleration", "singer"]
+    dims: int
+    noise: Matrix
+    tau: Matrix | None = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.dims, int) or self.dims < 1:
+            raise ModelError(f"dims must be a positive whole number of axes, got {self.dims!r}.")
+        words = _LAWS[self.law].words
+        for field, word in (("noise", words[0]), ("tau", words[1])):
+            value = getattr(self, field)
+            if value is None or not is_fixed(value):
+                continue
+            array = numbers(value, word)
+            if array.ndim < 2 and array.shape not in ((), (1,), (self.dims,)):
+                raise ModelError(f"{word} must be a number or one per axis ({self.dims},), got {array.shape}.")
+            if array.size and (array.min() < 0 or (field == "tau" and array.min() == 0)):
+                sign = "positive" if field == "tau" else "not negative"
+                raise ModelError(f"{word} must be {sign}, got {array.min():g}.")
+            object.__setattr__(self, field, array)
+
+    def __eq__(self, other: object) -> bool:
+        return same(self, other)
+
+    def dimension(self) -> int:
+        """Dimension of the state."""
+        return self.dims * _LAWS[self.law].order
+
+    def bind(self, chains: Sequence[Chain]) -> "Motion":
+        """Replace functions and tables by arrays with one mode axis per chain."""
+        noise_word, tau_word = _LAWS[self.law].words
+        noise = resolve(self.noise, chains, noise_word, (self.dims,))
+        tau = None if self.tau is None else resolve(self.tau, chains, tau_word, (self.dims,))
+        return replace(self, noise=noise, tau=tau)
+
+    def step(self, dt: FloatArray, t: FloatArray | None = None) -> Step:
+        """Matrices over intervals, in closed form."""
+        law = _LAWS[self.law]
+        noise, tau = self._parameters()
+        axes = max(noise.ndim, tau.ndim)
+        step = intervals(dt)
+        step = step.reshape(*step.shape, *(1,) * axes)
+        F, Q = law.blocks(step, noise, tau)
+        return Step(_blocks(F, self.dims), _blocks(Q, self.dims), None)
+
+    def sde(self) -> LinearSDE:
+        """The same motion as a stochastic differential equation.
+
+        Raises:
+            ModelError: acceleration constant within a scan has none.
+        """
+        if self.law == "velocity-scan":
+            raise ModelError(
+                "acceleration constant within a scan is no white noise and has no stochastic differential equation.\n"
+                "Use constant_velocity(..., kind='white')."
+            )
+        order = _LAWS[self.law].order
+        noise, tau = self._parameters()
+        shape = np.broadcast_shapes(noise.shape, tau.shape, (self.dims,))
+        F, G = np.zeros((*shape, order, order)), np.zeros((*shape, order, 1))
+        F[..., range(order - 1), range(1, order)] = 1.0
+        if self.law == "singer":
+            F[..., -1, -1] = -1 / tau
+            G[..., -1, 0] = noise * np.sqrt(2 / tau)
+        else:
+            G[..., -1, 0] = np.sqrt(noise)
+        return LinearSDE(_blocks(F, self.dims), _blocks(G, self.dims))
+
+    def _parameters(self) -> tuple[FloatArray, FloatArray]:
+        noise_word, tau_word = _LAWS[self.law].words
+        noise = fixed(self.noise, noise_word)
+        tau = np.ones(1) if self.tau is None else fixed(self.tau, tau_word)
+        return np.atleast_1d(noise), np.atleast_1d(tau)
+
+
+def _blocks(block: FloatArray, dims: int) -> FloatArray:
+    """Block-diagonal matrices (..., dims rows, dims cols) from blocks (..., dims|1, rows, cols)."""
+    rows, cols = block.shape[-2:]
+    lead = block.shape[:-3]
+    result = np.zeros((*lead, dims, rows, dims, cols))
+    axis = np.arange(dims)
+    result[..., axis, :, axis, :] = np.moveaxis(np.broadcast_to(block, (*lead, dims, rows, cols)), -3, 0)
+    return result.reshape(*lead, dims * rows, dims * cols)
+
+
+def _matrix(rows: Sequence[Sequence[FloatArray | float]]) -> FloatArray:
+    """Stack entries that broadcast against each other into matrices (..., rows, cols)."""
+    flat = np.broadcast_arrays(*(np.asarray(entry, dtype=np.float64) for row in rows for entry in row))
+    return np.stack(flat, axis=-1).reshape(*flat[0].shape, len(rows), len(rows[0]))
+
+
+def _velocity_scan(dt: FloatArray, accel: FloatArray, _: FloatArray) -> tuple[FloatArray, FloatArray]:
+    half = dt**2 / 2
+    Q = _matrix([[half**2, half * dt], [half * dt, dt**2]]) * (accel**2)[..., None, None]
+    return _matrix([[1.0, dt], [0.0, 1.0]]), Q
+
+
+def _velocity_white(dt: FloatArray, density: FloatArray, _: FloatArray) -> tuple[FloatArray, FloatArray]:
+    Q = _matrix([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * density[..., None, None]
+    return _matrix([[1.0, dt], [0.0, 1.0]]), Q
+
+
+def _acceleration(dt: FloatArray, density: FloatArray, _: FloatArray) -> tuple[FloatArray, FloatArray]:
+    Q = _matrix(
+        [
+            [dt**5 / 20, dt**4 / 8, dt**3 / 6],
+            [dt**4 / 8, dt**3 / 3, dt**2 / 2],
+            [dt**3 / 6, dt**2 / 2, dt],
+        ]
+    )
+    return _matrix([[1.0, dt, dt**2 / 2], [0.0, 1.0, dt], [0.0, 0.0, 1.0]]), Q * density[..., None, None]
+
+
+def _singer(dt: FloatArray, sigma: FloatArray, tau: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Each entry is a power of dt times a function of u = dt/tau that tends to the constant-acceleration value."""
+    u = dt / tau
+    f13, p11, p12, p13, p22 = (_entire(u, entry) for entry in _SINGER)
+    f23 = -np.expm1(-u) * tau
+    p23, p33 = f23**2 / 2, -np.expm1(-2 * u) * tau / 2
+    F = _matrix([[1.0, dt, f13 * dt**2], [0.0, 1.0, f23], [0.0, 0.0, np.exp(-u)]])
+    p11, p12, p13, p22 = p11 * dt**5, p12 * dt**4, p13 * dt**3, p22 * dt**3
+    Q = _matrix([[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]])
+    return F, Q * (2 * sigma**2 / tau)[..., None, None]
+
+
+class _Entire(NamedTuple):
+    """u^-power sum_k c_k u^k: the coefficients, and a closed form that is safe for u > 1."""
+
+    power: int
+    coefficient: Callable[[int], float]
+    closed: Callable[[FloatArray], FloatArray]
+
+
+# With e = exp(-u); each is the integral over (0, dt) of two rows of the impulse response
+# ((u - 1 + e)/a^2, (1 - e)/a, e), a = 1/tau, divided by dt^power.
+_SINGER = (
+    _Entire(2, lambda k: (-1.0) ** k / factorial(k), lambda u: u + np.expm1(-u)),
+    _Entire(
+        5,
+        lambda k: (-1.0) ** k * (4 * k - 2**k) / factorial(k) / 2,
+        lambda u: (1 - np.exp(-2 * u) + 2 * u + 2 * u**3 / 3 - 2 * u**2 - 4 * u * np.exp(-u)) / 2,
+    ),
+    _Entire(
+        4,
+        lambda k: (-1.0) ** k * (2**k - 2 - 2 * k) / factorial(k) / 2,
+        lambda u: (np.exp(-2 * u) + 1 - 2 * np.exp(-u) + 2 * u * np.exp(-u) - 2 * u + u**2) / 2,
+    ),
+    _Entire(
+        3,
+        lambda k: (-1.0) ** k * (2 * k - 2**k) / factorial(k) / 2,
+        lambda u: (1 - np.exp(-2 * u) - 2 * u * np.exp(-u)) / 2,
+    ),
+    _Entire(
+        3,
+        lambda k: (-1.0) ** k * (4 - 2**k) / factorial(k) / 2,
+        lambda u: (4 * np.exp(-u) - 3 - np.exp(-2 * u) + 2 * u) / 2,
+    ),
+)
+
+
+def _entire(u: FloatArray, entry: _Entire) -> FloatArray:
+    small, large = np.minimum(u, 1.0), np.maximum(u, 1.0)
+    series = np.zeros_like(u)
+    for k in range(entry.power + 26, entry.power - 1, -1):  # 2^30/30! < 1e-23 is dropped
+        series = series * small + entry.coefficient(k)
+    return np.where(u <= 1.0, series, entry.closed(large) / large**entry.power)
+
+
+class _Law(NamedTuple):
+    order: int  # states per axis
+    words: tuple[str, str]  # what messages call `noise` and `tau`
+    blocks: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+
+
+_LAWS = {
+    "velocity-scan": _Law(2, ("accel", ""), _velocity_scan),
+    "velocity-white": _Law(2, ("accel", ""), _velocity_white),
+    "acceleration": _Law(3, ("jerk", ""), _acceleration),
+    "singer": _Law(3, ("sigma", "tau"), _singer),
+}

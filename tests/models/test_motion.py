@@ -1,0 +1,118 @@
+import numpy as np
+import pytest
+from numpy.polynomial.legendre import leggauss
+
+from saltus.errors import ModelError
+from saltus.models import Chain, constant_acceleration, constant_velocity, discretise, singer
+
+WHITE = [
+    constant_velocity(2, accel=[0.5, 2.0], kind="white"),
+    constant_acceleration(2, jerk=0.3),
+    singer(2, tau=20.0, sigma=[1.0, 3.0]),
+]
+
+
+@pytest.mark.parametrize("motion", WHITE, ids=lambda m: m.law)
+def test_closed_forms_agree_with_discretise(motion):
+    dt = np.array([0.0, 1e-3, 0.1, 1.0, 4.0, 19.9, 20.1, 300.0])
+    step, sde = motion.step(dt), motion.sde()
+    Phi, Q = discretise(sde.F, sde.G, dt)
+    n = motion.dimension()
+    assert step.F.shape == step.Q.shape == (8, n, n)
+    # Entries differ by many orders of magnitude (dt^5 to dt): compare each with itself.
+    np.testing.assert_allclose(step.F, Phi, rtol=1e-11, atol=1e-14)
+    np.testing.assert_allclose(step.Q, Q, rtol=1e-11)
+
+
+@pytest.mark.parametrize("u", [1e-9, 1e-4, 0.1, 0.999999, 1.000001, 3.0, 60.0])
+def test_singer_by_quadrature(u):
+    # Gauss-Legendre of the impulse response, itself written without cancellation by phi functions.
+    tau, sigma = 5.0, 2.0
+    dt = u * tau
+    nodes, weights = leggauss(60)
+    pieces = max(1, int(u))  # the rule is exact to round-off over pieces of length tau
+    s = np.concatenate([(nodes + 1) / 2 * dt / pieces + k * dt / pieces for k in range(pieces)])
+    w = np.tile(weights / 2 * dt / pieces, pieces)
+    x = s / tau
+    phi2 = np.where(x < 0.5, sum((-x) ** k / np.prod(np.arange(1.0, k + 3)) for k in range(18)), 0)
+    phi2 = np.where(x < 0.5, phi2, (x + np.expm1(-x)) / np.where(x > 0, x, 1) ** 2)
+    response = np.stack([s**2 * phi2, -np.expm1(-x) * tau, np.exp(-x)])
+    expected = 2 * sigma**2 / tau * (response * w) @ response.T
+    np.testing.assert_allclose(singer(1, tau, sigma).step(np.asarray(dt)).Q, expected, rtol=2e-13)
+
+
+def test_singer_tends_to_constant_acceleration():
+    # Entry by entry, where a closed form in u = dt/tau = 1e-8 would have lost every digit.
+    dt, tau, sigma = np.array([0.1, 1.0]), 1e8, 3.0
+    limit = constant_acceleration(1, jerk=2 * sigma**2 / tau).step(dt)
+    step = singer(1, tau, sigma).step(dt)
+    np.testing.assert_allclose(step.Q, limit.Q, rtol=1e-7)
+    np.testing.assert_allclose(step.F, limit.F, rtol=1e-7)
+    assert np.linalg.eigvalsh(step.Q[1]).min() > 0
+
+
+def test_singer_published_values():
+    # A widely used toolbox's documentation prints these for dt = 1 s, tau = 20 s, sigma = 1 m/s^2 (4 decimals).
+    step = singer(1, 20.0, 1.0).step(np.asarray(1.0))
+    Q = [[0.0049, 0.0121, 0.0159], [0.0121, 0.0321, 0.0476], [0.0159, 0.0476, 0.0952]]
+    np.testing.assert_allclose(step.Q, Q, atol=5e-5)
+    np.testing.assert_allclose(step.F, [[1, 1, 0.4918], [0, 1, 0.9754], [0, 0, 0.9512]], atol=5e-5)
+
+
+def test_singer_acceleration_is_stationary():
+    step = singer(1, 5.0, 2.0).step(np.array([0.3, 7.0]))
+    np.testing.assert_allclose(step.F[:, 2, 2] ** 2 * 4.0 + step.Q[:, 2, 2], 4.0, rtol=1e-14)
+
+
+def test_acceleration_constant_within_a_scan():
+    T, sigma = 10.0, np.array([3.0, 35.0])
+    step = constant_velocity(2, accel=sigma).step(np.asarray(T))
+    g = np.array([T**2 / 2, T])
+    F, Q = np.zeros((4, 4)), np.zeros((4, 4))
+    for axis in range(2):  # x, vx, y, vy
+        part = slice(2 * axis, 2 * axis + 2)
+        F[part, part], Q[part, part] = [[1, T], [0, 1]], sigma[axis] ** 2 * np.outer(g, g)
+    np.testing.assert_allclose(step.F, F)
+    np.testing.assert_allclose(step.Q, Q)
+
+
+@pytest.mark.parametrize("motion", WHITE, ids=lambda m: m.law)
+def test_two_intervals_are_one(motion):
+    F, Q, _ = motion.step(np.array([1.3, 2.9, 4.2]))
+    np.testing.assert_allclose(F[2], F[1] @ F[0], rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(Q[2], F[1] @ Q[0] @ F[1].T + Q[1], rtol=1e-11)
+
+
+def test_parameters_depend_on_chains():
+    mode = Chain("mode", {"calm": 1.0, "wild": 9.0}, stay=0.9)
+    place = Chain("place", ["near", "far"], stay=0.5)
+    motion = singer(2, tau=lambda place: 5.0 if place == "near" else 50.0, sigma=lambda mode: [mode, 2 * mode])
+    step = motion.bind([mode, place]).step(np.array([1.0, 2.0, 3.0]))
+    assert step.F.shape == (3, 1, 2, 6, 6) and step.Q.shape == (3, 2, 2, 6, 6)
+    one = singer(2, tau=50.0, sigma=[9.0, 18.0]).step(np.asarray(2.0))
+    np.testing.assert_allclose(step.Q[1, 1, 1], one.Q, rtol=1e-14)
+    np.testing.assert_allclose(step.F[1, 0, 1], one.F, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "build, message",
+    [
+        (lambda: constant_velocity(0, accel=1.0), "positive whole number of axes, got 0"),
+        (lambda: constant_velocity(2, accel=-1.0), "accel must be not negative, got -1"),
+        (lambda: constant_velocity(2, accel=[1.0, 2.0, 3.0]), r"accel must be a number or one per axis \(2,\)"),
+        (lambda: constant_velocity(2, accel=1.0, kind="scan").sde(), "has no stochastic differential equation"),
+        (lambda: constant_acceleration(1, jerk=np.nan), "jerk holds nan"),
+        (lambda: singer(1, tau=0.0, sigma=1.0), "tau must be positive, got 0"),
+        (lambda: singer(1, tau=1.0, sigma="big"), "sigma must be real numbers"),
+        (lambda: singer(1, tau=1.0, sigma=lambda m: m).step(np.asarray(1.0)), "put it into a HybridModel"),
+    ],
+)
+def test_bad_motion(build, message):
+    with pytest.raises(ModelError, match=message):
+        build()
+
+
+def test_negative_values_of_a_chain_are_found():
+    chain = Chain("c", {"a": 1.0, "b": -1.0}, stay=0.9)
+    with pytest.raises(ModelError, match="accel must be not negative, got -1"):
+        constant_velocity(1, accel=lambda c: c).bind([chain])
