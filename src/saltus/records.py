@@ -57,6 +57,8 @@ class System:
         """Like `CAT048:20/129`, or the name for tables."""
         if self.category is None:
             return self.name
+        if self.sac is None:
+            return f"CAT{self.category:03d}"
         return f"CAT{self.category:03d}:{self.sac}/{self.sic}"
 
 

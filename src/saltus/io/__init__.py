@@ -1,1 +1,108 @@
-"""Package under construction."""
+"""Recordings in: ASTERIX files, packet captures and tables become target reports as arrays."""
+
+import datetime
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from saltus.errors import DataError
+from saltus.io.merge import merge
+from saltus.io.part import Part
+from saltus.records import Recording
+
+__all__ = ["FORMATS", "Format", "read"]
+
+Progress = Callable[[str, float], None]
+Reader = Callable[[Path, datetime.date | None, Mapping[int, str], Progress | None], Part]
+
+
+class Format(NamedTuple):
+    """One input format: how it is called and told, and what reads it."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    magic: tuple[bytes, ...]  # the file's first bytes; they go before the suffix
+    reader: Reader
+
+
+def _asterix(path: Path, date: datetime.date | None, editions: Mapping[int, str], progress: Progress | None) -> Part:
+    from saltus.io.asterix import read_asterix
+
+    return read_asterix(path, date=date, editions=editions, progress=progress)
+
+
+def _csv(path: Path, date: datetime.date | None, editions: Mapping[int, str], progress: Progress | None) -> Part:
+    del date, editions, progress
+    from saltus.io.table import read_csv
+
+    return read_csv(path)
+
+
+def _parquet(path: Path, date: datetime.date | None, editions: Mapping[int, str], progress: Progress | None) -> Part:
+    del date, editions, progress
+    from saltus.io.table import read_parquet
+
+    return read_parquet(path)
+
+
+_PCAP = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
+
+FORMATS = (
+    Format("Parquet table", (".parquet", ".pq"), (b"PAR1",), _parquet),
+    Format("packet capture", (".pcap", ".pcapng", ".cap"), _PCAP, _asterix),
+    Format("ASTERIX", (".ast", ".raw", ".asterix"), (), _asterix),
+    Format("CSV table", (".csv",), (), _csv),
+)
+
+
+def read(
+    paths: Sequence[Path | str],
+    *,
+    date: datetime.date | None = None,
+    editions: Mapping[int, str] | None = None,
+    progress: Progress | None = None,
+) -> Recording:
+    """Read files and merge them by time.
+
+    The format is told by the first bytes, else by the suffix, else by ASTERIX blocks at the start.
+
+    Args:
+        paths: files; each by its name in messages and in `Plots.files`.
+        date: of the first record of ASTERIX files (past midnight counts on). Without it captures use their own
+            clock, plain files count from 1970-01-01 and say so among the problems.
+        editions: ASTERIX category -> edition, as "0.23"; categories not named are guessed.
+        progress: called with a file's name and the fraction read.
+
+    Raises:
+        DataError: a file is empty, of unknown format or without one readable record.
+    """
+    if not paths:
+        raise DataError("no input given: name at least one recording.")
+    parts = []
+    for path in [Path(p) for p in paths]:
+        parts.append(_format_of(path).reader(path, date, editions or {}, progress))
+    return merge(parts)
+
+
+def _format_of(path: Path) -> Format:
+    if path.is_dir():
+        raise DataError(f"{path}: is a directory; name the files in it.")
+    with path.open("rb") as file:
+        head = file.read(1 << 17)
+    if not head:
+        raise DataError(f"{path}: byte 0: the file is empty.")
+    for entry in FORMATS:
+        if head.startswith(entry.magic):
+            return entry
+    for entry in FORMATS:
+        if path.suffix.lower() in entry.suffixes:
+            return entry
+    from saltus.io.blocks import looks_like_asterix
+
+    if looks_like_asterix(head):
+        return next(entry for entry in FORMATS if entry.reader is _asterix)
+    known = "; ".join(f"{entry.name} ({', '.join(entry.suffixes)})" for entry in FORMATS)
+    raise DataError(
+        f"{path}: unknown format: it begins with {head[:8].hex(' ')} and not with an ASTERIX block. Known: {known}. "
+        "A recorder's own container must be saved as plain ASTERIX blocks first."
+    )

@@ -1,0 +1,125 @@
+"""Times of day to times, and the reports whose time cannot be right."""
+
+from collections import deque
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from jaxtyping import Float, Int
+
+__all__ = ["DAY", "SORTING_WINDOW", "OrderFaults", "day_offsets", "order_faults"]
+
+DAY = 86400.0  # s
+SORTING_WINDOW = 2.0  # s: radars send sector by sector, multi-channel receivers a little late
+_WILD = 60.0  # s: a report this far behind is no late report, its clock jumped
+_LONE = 600.0  # s: the last reports of a file have no followers to confirm a leap of this size
+_AHEAD, _FOR_GOOD, _EXCURSION = 10, 50, 100  # reports looked at to tell wild, lasting and passing steps apart
+
+
+class OrderFaults(NamedTuple):
+    """Which reports of one source stand at a time that cannot be right."""
+
+    late: npt.NDArray[np.bool_]  # older than the newest by more than the sorting window
+    jump: npt.NDArray[np.bool_]  # a wild time, or one the clock repeated after it was set back
+    steps: tuple[int, ...]  # indices at which the clock stepped back for good
+
+
+def day_offsets(time_of_day: npt.ArrayLike) -> Int[np.ndarray, " n"]:
+    """Count midnights: the number of days to add to each time of day, in the order received.
+
+    Each time is put within half a day of the median of the last 15, so a wild time starts no new day.
+
+    Args:
+        time_of_day: (N,) s after midnight; NaN is passed over and gets 0.
+
+    Returns:
+        Days since the first report's, (N,).
+    """
+    tod = np.asarray(time_of_day, np.float64)
+    days = np.zeros(len(tod), np.int64)
+    valid = np.flatnonzero(np.isfinite(tod))
+    times = tod[valid]
+    if not np.any(np.abs(np.diff(times)) > DAY / 2):
+        return days
+    head = times[:15]
+    apart = np.abs((head[:, None] - head + DAY / 2) % DAY - DAY / 2)  # on the circle of the day
+    anchor = int(np.argmin(np.median(apart, axis=1)))
+    recent = deque([float(head[anchor])], maxlen=15)
+    found = np.empty(len(times), np.int64)
+    for k, t in enumerate(times.tolist()):
+        reference = sorted(recent)[len(recent) // 2]
+        found[k] = round((reference - t) / DAY)
+        recent.append(t + DAY * found[k])
+    first = int(np.argmax(apart[anchor] < DAY / 4))  # the first that agrees with its neighbours
+    days[valid] = found - found[first]
+    return days
+
+
+def order_faults(time: Float[np.ndarray, " n"]) -> OrderFaults:
+    """Find late reports and clock jumps among the times of one source, in the order received.
+
+    The newest credible time is the watermark. A report ahead of it is credible unless most of the next ten are
+    older than it (a lone wild time must not make its neighbours late). A report behind it by more than the sorting
+    window is late, or a jump when it is a minute or more behind. When nine in ten of the next fifty are behind
+    as well, the clock was set back for good: the reports from there on are right and keep their times, and of the
+    earlier ones those in the interval that the clock then repeats are jumps (if the clock had only leapt ahead for
+    up to a hundred reports, these are). Leaps ahead for good are gaps.
+
+    Args:
+        time: (N,) s, finite.
+    """
+    n = len(time)
+    late, jump = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    steps: list[int] = []
+    behind = np.maximum.accumulate(time) - time if n else time
+    if not np.any(behind > SORTING_WINDOW) and not np.any(np.diff(time[-4:]) > _LONE):
+        return OrderFaults(late, jump, ())
+    mark, leap, before = -np.inf, 0, np.inf  # watermark; last leap ahead: where, and the watermark before it
+    for k in range(n):
+        t = float(time[k])
+        if t >= mark - SORTING_WINDOW:
+            if t > mark + SORTING_WINDOW:
+                if _stands_alone(time, k, mark):
+                    jump[k] = True
+                    continue
+                if t > mark + _WILD and np.isfinite(mark):
+                    leap, before = k, mark
+            mark = max(mark, t)
+            continue
+        ahead = time[k : k + _FOR_GOOD]
+        lasting = len(ahead) >= _AHEAD and np.mean(ahead < mark - SORTING_WINDOW) >= 0.9
+        if lasting and abs(t - np.median(ahead[:_AHEAD])) < _WILD:
+            if t >= before - SORTING_WINDOW and k - leap <= _EXCURSION:
+                jump[leap:k] = True
+                mark = max(before, t)
+            else:
+                steps.append(k)
+                mark = t
+            before = np.inf
+        elif mark - t > _WILD:
+            jump[k] = True
+        else:
+            late[k] = True
+    _mark_repeated(time, late, jump, steps)
+    return OrderFaults(late & ~jump, jump, tuple(steps))
+
+
+def _stands_alone(time: npt.NDArray[np.float64], k: int, mark: float) -> bool:
+    followers = time[k + 1 : k + 1 + _AHEAD]
+    if len(followers) < 3 and np.isfinite(mark) and time[k] - mark > _LONE:
+        return True
+    return len(followers) > 0 and float(np.mean(followers < time[k] - SORTING_WINDOW)) > 0.5
+
+
+def _mark_repeated(
+    time: npt.NDArray[np.float64],
+    late: npt.NDArray[np.bool_],
+    jump: npt.NDArray[np.bool_],
+    steps: list[int],
+) -> None:
+    """Mark the reports before each step back whose times occur again after it."""
+    for step, end in pairwise([*steps, len(time)]):
+        again = time[step:end][~(late | jump)[step:end]]
+        if len(again):
+            jump[:step] |= (time[:step] >= again.min()) & (time[:step] <= again.max())

@@ -1,0 +1,173 @@
+"""Files to one recording: what cannot be a plot is marked, counted by reason, and the rest put in time order."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from saltus.io.clock import DAY, order_faults
+from saltus.io.part import Part
+from saltus.records import REASONS, Contents, Kind, Plots, Recording
+
+__all__ = ["LIMITS", "merge"]
+
+# What a report can say: ranges of ground radars (m), pressure altitudes of aircraft (m), epochs from 1970 to 2100.
+LIMITS = {
+    "range": (1e-9, 600e3),
+    "azimuth": (-2 * np.pi, 2 * np.pi),
+    "elevation": (-np.pi / 2, np.pi / 2),
+    "x": (-600e3, 600e3),
+    "y": (-600e3, 600e3),
+    "latitude": (-np.pi / 2, np.pi / 2),
+    "longitude": (-np.pi, 2 * np.pi),
+    "altitude": (-1500.0, 60000.0),
+    "time": (-DAY, 4.2e9),
+}
+_POSITION = {
+    Kind.POLAR: ("range", "azimuth"),
+    Kind.PLANE: ("x", "y"),
+    Kind.GEODETIC: ("latitude", "longitude"),
+}
+
+
+def merge(parts: Sequence[Part]) -> Recording:
+    """Join what was read of each file.
+
+    Reports that cannot be plots keep their row and get a reason, in this order: what the reader found (coasted,
+    simulated, ...), no position, no time, not a number, out of range, duplicate (same source, time, address and
+    position to the bit as an earlier usable report), and per source and file clock jump and out of order
+    (`saltus.io.clock.order_faults`).
+    """
+    parts, problems = _align_days(parts)
+    plots = Plots.concat([part.plots for part in parts])
+    reason = plots.reason.copy()
+    _mark_values(plots, reason)
+    _mark_duplicates(plots, reason)
+    for k, part in enumerate(parts):
+        if part.in_order:
+            problems += _mark_order(plots, reason, k)
+    plots = replace(plots, reason=reason)
+    tables = [part.tracks for part in parts if part.tracks is not None]
+    first_file = np.cumsum([0] + [len(part.plots.files) for part in parts])
+    return Recording(
+        plots=plots.sorted_by_time(),
+        tracks=pa.concat_tables(tables).sort_by("time") if tables else None,
+        contents=tuple(
+            _count(line, plots, int(k)) for k, part in zip(first_file, parts, strict=False) for line in part.contents
+        ),
+        problems=tuple(p for part in parts for p in part.problems) + tuple(problems),
+    )
+
+
+def _mark(reason: npt.NDArray[np.int8], holds: npt.NDArray[np.bool_], text: str) -> None:
+    """Give a reason to the reports that have none yet."""
+    reason[holds & (reason == 0)] = REASONS.index(text)
+
+
+def _mark_values(plots: Plots, reason: npt.NDArray[np.int8]) -> None:
+    """Mark positions and times that are missing or cannot be."""
+    _mark(reason, plots.kind == Kind.NONE, "no position")
+    not_number, outside = np.zeros(len(plots), np.bool_), np.zeros(len(plots), np.bool_)
+    for kind, names in _POSITION.items():
+        for name in names:
+            not_number |= (plots.kind == kind) & np.isnan(getattr(plots, name))
+            outside |= (plots.kind == kind) & _outside(plots, name)
+    _mark(reason, np.isnan(plots.time), "no time")
+    for name in ("time", "altitude", "elevation"):
+        outside |= _outside(plots, name)
+    _mark(reason, not_number, "not a number")
+    _mark(reason, outside, "out of range")
+
+
+def _outside(plots: Plots, name: str) -> npt.NDArray[np.bool_]:
+    values, (low, high) = getattr(plots, name), LIMITS[name]
+    outside: npt.NDArray[np.bool_] = ~np.isnan(values) & ~((values >= low) & (values <= high))
+    return outside
+
+
+def _mark_duplicates(plots: Plots, reason: npt.NDArray[np.int8]) -> None:
+    """Mark usable reports that repeat an earlier one to the bit."""
+    usable = np.flatnonzero(reason == 0)
+    words = [plots.source[usable].astype(np.int64), plots.kind[usable].astype(np.int64)]
+    words += [plots.icao24[usable].astype(np.int64), plots.time[usable].view(np.int64)]
+    for names in zip(*_POSITION.values(), strict=True):  # the coordinates of the report's own kind
+        kinds = [plots.kind[usable] == kind for kind in _POSITION]
+        words.append(np.select(kinds, [getattr(plots, n)[usable].view(np.int64) for n in names]))
+    order = np.lexsort(words[::-1])  # stable: earlier reports first
+    table = np.stack(words)[:, order]
+    again = np.all(table[:, 1:] == table[:, :-1], axis=0)
+    reason[usable[order[1:][again]]] = REASONS.index("duplicate")
+
+
+def _mark_order(plots: Plots, reason: npt.NDArray[np.int8], file: int) -> list[str]:
+    """Mark the reports of one file that come too late or whose clock jumped; tell lasting steps."""
+    told = []
+    skipped = [REASONS.index(text) for text in ("duplicate", "no time", "system track")]
+    for k, source in enumerate(plots.sources):
+        mine = (plots.file == file) & (plots.source == k) & ~np.isin(reason, skipped)
+        index = np.flatnonzero(mine & np.isfinite(plots.time))
+        faults = order_faults(plots.time[index])
+        jump, late = np.zeros(len(plots), np.bool_), np.zeros(len(plots), np.bool_)
+        jump[index], late[index] = faults.jump, faults.late
+        _mark(reason, jump, "clock jump")
+        _mark(reason, late, "out of order")
+        for step in faults.steps:
+            back = plots.time[index[step - 1]] - plots.time[index[step]]
+            told.append(
+                f"{plots.files[file]}: record {plots.record[index[step]]} of {source.system}: the clock steps back by "
+                f"{back:.3f} s for good. Later reports keep their times; of the earlier ones those in the interval "
+                "that the clock repeats are not used (clock jump)."
+            )
+    return told
+
+
+def _align_days(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
+    """Put a file that begins after midnight on the day after the others of the same night.
+
+    Plain ASTERIX tells the time of day only, and the date given is that of the first record. So when one file
+    crosses midnight, another that begins more than 12 hours before it belongs to the next day.
+    """
+    aligned = list(parts)
+    problems = []
+    spans = [
+        (min(t), max(t))
+        for t in ([v for c in p.contents for v in (c.time_from, c.time_to) if v == v] or [np.nan] for p in parts)
+    ]
+    plain = [k for k, part in enumerate(parts) if part.in_order and not part.dated]
+    crossing = [spans[k][0] for k in plain if spans[k][0] // DAY < spans[k][1] // DAY]
+    for k in plain:
+        if crossing and min(crossing) - spans[k][0] > DAY / 2:
+            aligned[k] = _shift(parts[k], DAY)
+            name = ", ".join(parts[k].plots.files)
+            problems.append(f"{name}: begins after the midnight that another file crosses: put on the next day.")
+    return aligned, problems
+
+
+def _shift(part: Part, seconds: float) -> Part:
+    tracks = part.tracks
+    if tracks is not None:
+        column = tracks.column_names.index("time")
+        tracks = tracks.set_column(column, "time", pa.array(tracks["time"].to_numpy() + seconds))
+    return part._replace(
+        plots=replace(part.plots, time=part.plots.time + seconds),
+        tracks=tracks,
+        contents=tuple(replace(c, time_from=c.time_from + seconds, time_to=c.time_to + seconds) for c in part.contents),
+    )
+
+
+def _count(line: Contents, plots: Plots, file: int) -> Contents:
+    """Complete a line of contents: reports rejected by reason, and the span of those whose time is credible."""
+    own = [k for k, s in enumerate(plots.sources) if s.system == line.system]
+    mine = (plots.file == file) & np.isin(plots.source, own)
+    counts = Counter(plots.reason[mine & (plots.reason > 0)].tolist())
+    line = replace(line, rejected={REASONS[code]: n for code, n in sorted(counts.items())})
+    wild = [
+        REASONS.index(text) for text in ("clock jump", "out of order", "no time", "out of range", "coasted by station")
+    ]
+    times = plots.time[mine & ~np.isin(plots.reason, wild)]
+    if line.n_records == line.n_reports and len(times):
+        return replace(line, time_from=float(times.min()), time_to=float(times.max()))
+    return line

@@ -1,0 +1,43 @@
+"""What a reader makes of one file, before files are merged."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from jaxtyping import Int
+
+from saltus.records import Contents, Plots
+
+__all__ = ["Part", "revisit"]
+
+_FEW = 5  # intervals that make a median
+
+
+class Part(NamedTuple):
+    """One file: its target reports in file order, and the lines of `saltus info` without the rejected reports."""
+
+    plots: Plots
+    tracks: pa.Table | None
+    contents: tuple[Contents, ...]
+    problems: tuple[str, ...]
+    in_order: bool  # the order of the reports is the order of reception (not so in tables)
+    dated: bool  # the file tells the date itself
+
+
+def revisit(time: npt.ArrayLike, *identities: Int[np.ndarray, " n"]) -> float:
+    """Median time between two reports of one target, s, NaN when none returns.
+
+    Args:
+        time: (N,) s.
+        identities: columns that tell targets apart, the best first, -1 = not given; the first that tells any is used.
+    """
+    times = np.asarray(time, np.float64)
+    for identity in identities:
+        known = (identity >= 0) & np.isfinite(times)
+        order = np.lexsort((times[known], identity[known]))
+        who, when = identity[known][order], times[known][order]
+        step = np.diff(when)[(np.diff(who) == 0) & (np.diff(when) > 0)]
+        if len(step) >= _FEW:
+            return float(np.median(step))
+    return float("nan")

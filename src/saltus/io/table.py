@@ -1,0 +1,308 @@
+"""Target reports as CSV or Parquet tables, one row a report, in any order.
+
+Columns, by name; others are passed over and noted:
+
+    time            UTC seconds since 1970-01-01, or ISO 8601 text (without an offset it is UTC); always needed
+    range_m         slant range, m, with
+    azimuth_deg     degrees from north, clockwise, 0 to 360 (or -180 to 180), and
+    elevation_deg   degrees above the horizontal, -90 to 90, if measured
+    x_m, y_m        m east and north of the sensor's site
+    latitude, longitude  (or lat, lon)  degrees, WGS-84
+    altitude_m      m, -1500 to 60000
+    icao24          Mode S address, six hexadecimal digits as text
+    mode3a          Mode 3/A code, four octal digits as text
+    callsign        up to 8 characters
+    on_ground       (or onground)  true or 1 on the ground, false or 0 airborne
+    source          the sensor's name; without it the file's name without suffix
+
+One of the three positions is needed; where a row gives several the first named above is taken. An empty cell (null,
+NaN) is absent. A row without time or position, or with a number that cannot be, is kept as a report with its reason; a
+code that cannot be read is lost alone. Rows count from 0, without the header.
+"""
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from saltus.errors import DataError
+from saltus.io.merge import LIMITS
+from saltus.io.part import Part, revisit
+from saltus.records import Contents, Kind, Plots, Source, System
+
+__all__ = ["read_csv", "read_parquet"]
+
+_ALIASES = {"lat": "latitude", "lon": "longitude", "onground": "on_ground"}
+_DEGREE = np.pi / 180
+# column -> (column of Plots, factor to SI units)
+_NUMBERS = {
+    "range_m": ("range", 1.0),
+    "azimuth_deg": ("azimuth", _DEGREE),
+    "elevation_deg": ("elevation", _DEGREE),
+    "x_m": ("x", 1.0),
+    "y_m": ("y", 1.0),
+    "latitude": ("latitude", _DEGREE),
+    "longitude": ("longitude", _DEGREE),
+    "altitude_m": ("altitude", 1.0),
+}
+_POSITIONS = (
+    (Kind.POLAR, ("range_m", "azimuth_deg")),
+    (Kind.PLANE, ("x_m", "y_m")),
+    (Kind.GEODETIC, ("latitude", "longitude")),
+)
+_CODES = {"icao24": (16, 0xFFFFFF), "mode3a": (8, 0o7777)}  # base, largest
+_COLUMNS = ("time", *_NUMBERS, *_CODES, "callsign", "on_ground", "source")
+_TRUTH = {"true": 1, "1": 1, "1.0": 1, "t": 1, "yes": 1, "false": 0, "0": 0, "0.0": 0, "f": 0, "no": 0}
+_HALF = 0.5  # a column with more impossible values than this has another unit
+
+
+def read_csv(path: Path) -> Part:
+    """Read a CSV table with a header line.
+
+    Raises:
+        DataError: no CSV, needed columns are missing, or a column's unit cannot be right.
+    """
+    from pyarrow import csv
+
+    try:
+        with csv.open_csv(path) as reader:
+            names = reader.schema.names
+        as_text = csv.ConvertOptions(column_types={name: pa.string() for name in names}, strings_can_be_null=True)
+        table = csv.read_csv(path, convert_options=as_text)
+    except pa.ArrowInvalid as error:
+        raise DataError(f"{path}: no readable CSV table: {str(error).splitlines()[0]}") from error
+    return _read(path, table)
+
+
+def read_parquet(path: Path) -> Part:
+    """Read a Parquet table; numbers may be of any type and are taken as float64.
+
+    Raises:
+        DataError: no Parquet, needed columns are missing, or a column's unit cannot be right.
+    """
+    from pyarrow import parquet
+
+    try:
+        table = parquet.read_table(path)
+    except pa.ArrowInvalid as error:
+        raise DataError(f"{path}: no readable Parquet table: {str(error).splitlines()[0]}") from error
+    return _read(path, table)
+
+
+def _read(path: Path, table: pa.Table) -> Part:
+    table = table.rename_columns(
+        [_ALIASES.get(c, c) if _ALIASES.get(c) not in table.column_names else c for c in table.column_names]
+    )
+    names = table.column_names
+    twice = sorted({c for c in names if names.count(c) > 1 and c in _COLUMNS})
+    if twice:
+        raise DataError(f"{path}: column {twice[0]!r} occurs {names.count(twice[0])} times; keep one.")
+    _need_columns(path, names)
+    if not table.num_rows:
+        raise DataError(f"{path}: row 0: the table has columns and no row.")
+    problems: list[str] = []
+    columns: dict[str, npt.ArrayLike] = {"time": _times(path, table["time"], problems)}
+    for name, (target, factor) in _NUMBERS.items():
+        if name in names:
+            columns[target] = _numbers(path, name, table[name], problems) * factor
+    for name, (base, largest) in _CODES.items():
+        if name in names:
+            columns[name] = _codes(path, name, table[name], base, largest, problems)
+    if "callsign" in names:
+        columns["callsign"] = [str(v or "").strip() for v in table["callsign"].to_pylist()]
+    if "on_ground" in names:
+        columns["on_ground"] = _truths(path, table["on_ground"], problems)
+    columns["kind"] = _kinds(columns, names)
+    _check_units(path, columns)
+    _tell_impossible(path, columns, problems)
+    return _part(path, table, columns, problems)
+
+
+def _need_columns(path: Path, names: Sequence[str]) -> None:
+    pairs = [pair for _, pair in _POSITIONS]
+    if "time" not in names or not any(set(pair) <= set(names) for pair in pairs):
+        wanted = "time" if "time" not in names else "a position: " + ", or ".join(" and ".join(p) for p in pairs)
+        shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+        raise DataError(f"{path}: no column for {wanted}. The columns are: {shown}. Names and units are fixed.")
+
+
+def _times(path: Path, column: pa.ChunkedArray, problems: list[str]) -> npt.NDArray[np.float64]:
+    """UTC seconds from numbers, time stamps or text."""
+    if pa.types.is_timestamp(column.type):
+        micro = column.cast(pa.timestamp("us"), safe=False).cast(pa.int64())
+        return _floats(micro) / 1e6
+    if not _is_text(column.type):
+        return _numbers(path, "time", column, problems)
+    values = np.full(len(column), np.nan)
+    bad = []
+    for k, text in enumerate(column.to_pylist()):
+        try:
+            values[k] = _seconds(text) if text else np.nan
+        except ValueError:
+            bad.append((k, text))
+    _tell(path, "time", bad, "neither seconds nor ISO 8601", problems)
+    return values
+
+
+def _seconds(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        moment = datetime.datetime.fromisoformat(text.strip())
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=datetime.UTC)
+    epoch = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    return (moment - epoch) / datetime.timedelta(seconds=1)
+
+
+def _numbers(path: Path, name: str, column: pa.ChunkedArray, problems: list[str]) -> npt.NDArray[np.float64]:
+    """A column as float64, absent and unreadable cells NaN."""
+    if not _is_text(column.type):
+        try:
+            return _floats(column)
+        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+            raise DataError(f"{path}: column {name!r} is of type {column.type}; it must hold numbers.") from error
+    values = np.full(len(column), np.nan)
+    bad = []
+    for k, text in enumerate(column.to_pylist()):
+        try:
+            values[k] = float(text) if text else np.nan
+        except ValueError:
+            bad.append((k, text))
+    _tell(path, name, bad, "no number", problems)
+    return values
+
+
+def _floats(column: pa.ChunkedArray) -> npt.NDArray[np.float64]:
+    values: npt.NDArray[np.float64] = column.cast(pa.float64(), safe=False).to_numpy().astype(np.float64)
+    return values
+
+
+def _codes(
+    path: Path, name: str, column: pa.ChunkedArray, base: int, largest: int, problems: list[str]
+) -> npt.NDArray[np.int64]:
+    """Codes from text in base 16 or 8, absent and unreadable ones -1."""
+    kind = {16: "hexadecimal", 8: "octal"}[base]
+    if not (_is_text(column.type) or pa.types.is_null(column.type)):
+        raise DataError(f"{path}: column {name!r} is of type {column.type}; give {kind} digits as text.")
+    values = np.full(len(column), -1, np.int64)
+    bad = []
+    for k, text in enumerate(column.to_pylist()):
+        if text and text.strip():
+            try:
+                values[k] = int(text.strip(), base)
+            except ValueError:
+                bad.append((k, text))
+            else:
+                if not 0 <= values[k] <= largest:
+                    bad.append((k, text))
+                    values[k] = -1
+    _tell(path, name, bad, f"no {kind} code", problems)
+    return values
+
+
+def _truths(path: Path, column: pa.ChunkedArray, problems: list[str]) -> npt.NDArray[np.int64]:
+    cells = ["" if v is None else str(v).strip().lower() for v in column.to_pylist()]
+    bad = [(k, v) for k, v in enumerate(cells) if v not in _TRUTH and v not in ("", "nan")]
+    _tell(path, "on_ground", bad, "neither true nor false", problems)
+    return np.array([_TRUTH.get(v, -1) for v in cells], np.int64)
+
+
+def _kinds(columns: dict[str, npt.ArrayLike], names: Sequence[str]) -> npt.NDArray[np.int8]:
+    """How each row gives its position: the first pair with both cells, else a pair that lacks one."""
+    n = len(np.asarray(columns["time"]))
+    kinds = np.full(n, Kind.NONE, np.int8)
+    for needed in (2, 1):
+        for kind, pair in _POSITIONS:
+            if set(pair) <= set(names):
+                given = sum(~np.isnan(np.asarray(columns[_NUMBERS[c][0]])) for c in pair)
+                kinds[(kinds == Kind.NONE) & (given >= needed)] = kind
+    return kinds
+
+
+def _check_units(path: Path, columns: dict[str, npt.ArrayLike]) -> None:
+    """Refuse a column most of whose values cannot be: its unit is another."""
+    for name, values, outside in _impossible(columns):
+        given = ~np.isnan(values)
+        if np.count_nonzero(outside) > _HALF * np.count_nonzero(given):
+            k = int(outside.argmax())
+            hint = "seconds since 1970, not milliseconds?" if name == "time" else f"is it in {_unit(name)}?"
+            raise DataError(
+                f"{path}: row {k}, column {name!r}: {values[k]:g} cannot be, like {np.count_nonzero(outside)} of "
+                f"{np.count_nonzero(given)} values: {hint}"
+            )
+
+
+def _tell_impossible(path: Path, columns: dict[str, npt.ArrayLike], problems: list[str]) -> None:
+    for name, values, outside in _impossible(columns):
+        bad = [(int(k), f"{values[k]:g}") for k in np.flatnonzero(outside)]
+        _tell(path, name, bad, "out of range", problems)
+
+
+def _impossible(
+    columns: dict[str, npt.ArrayLike],
+) -> list[tuple[str, npt.NDArray[np.float64], npt.NDArray[np.bool_]]]:
+    """Each numeric column in the units of the table, and which of its values cannot be."""
+    found = []
+    for name, (target, factor) in {"time": ("time", 1.0), **_NUMBERS}.items():
+        if target in columns:
+            values = np.asarray(columns[target], np.float64)
+            low, high = LIMITS[target]
+            outside = ~np.isnan(values) & ~((values >= low * (1 + 1e-12)) & (values <= high * (1 + 1e-12)))
+            found.append((name, values / factor, outside))
+    return found
+
+
+def _unit(name: str) -> str:
+    return "m" if name.endswith("_m") else "degrees"
+
+
+def _tell(path: Path, name: str, bad: Sequence[tuple[int, object]], what: str, problems: list[str]) -> None:
+    if bad:
+        row, cell = bad[0]
+        more = f", and in {len(bad) - 1} more rows" if len(bad) > 1 else ""
+        problems.append(f"{path.name}: row {row}, column {name!r}: {str(cell)[:40]!r} is {what}{more}.")
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind))
+
+
+def _part(path: Path, table: pa.Table, columns: dict[str, npt.ArrayLike], problems: list[str]) -> Part:
+    n = table.num_rows
+    named = table["source"].to_pylist() if "source" in table.column_names else [None] * n
+    labels = [str(v) if v not in (None, "") else path.stem for v in named]
+    systems = [System(None, None, None, label) for label in sorted(set(labels))]
+    position = {s.name: k for k, s in enumerate(systems)}
+    columns |= {"source": [position[label] for label in labels], "file": np.zeros(n), "record": np.arange(n)}
+    plots = Plots.build(n, tuple(Source(s) for s in systems), (path.name,), columns)
+    unused = [c for c in table.column_names if c not in _COLUMNS]
+    notes = (f"columns not used: {', '.join(unused)}",) if unused else ()
+    contents = tuple(_contents(path, s, plots.take(plots.source == k), table, notes) for k, s in enumerate(systems))
+    return Part(plots, None, contents, tuple(problems), in_order=False, dated=True)
+
+
+def _contents(path: Path, system: System, own: Plots, table: pa.Table, notes: tuple[str, ...]) -> Contents:
+    given = {c: table[c].take(pa.array(own.record)) for c in table.column_names if c in _COLUMNS}
+    times = own.time[np.isfinite(own.time)]
+    kinds = {Kind.POLAR: "range and azimuth", Kind.PLANE: "plane position", Kind.GEODETIC: "latitude and longitude"}
+    counts = {text: int(np.count_nonzero(own.kind == kind)) for kind, text in kinds.items()}
+    return Contents(
+        file=path.name,
+        system=system,
+        edition="",
+        n_records=len(own),
+        n_reports=len(own),
+        time_from=float(times.min()) if len(times) else float("nan"),
+        time_to=float(times.max()) if len(times) else float("nan"),
+        update_period=revisit(own.time, own.icao24, own.mode3a),
+        fields={c: len(v) - v.null_count for c, v in given.items()},
+        rejected={},
+        n_by_type={text: n for text, n in counts.items() if n},
+        notes=notes,
+    )
