@@ -1,0 +1,181 @@
+"""Write the report: the frame from a template, the data inside it, nothing fetched from anywhere."""
+
+import json
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from saltus.io.write import output_file
+from saltus.records import Plots
+from saltus.report.colours import HEIGHT_ENDS, PROBABILITY_ENDS, colour_map
+from saltus.report.data import payload, time_span
+from saltus.report.tables import Block, blocks, innovation_rows, reason_rows, show, title
+from saltus.report.updates import Updates, groups, read_updates
+
+if TYPE_CHECKING:
+    import jinja2
+    import pyarrow as pa
+
+    from saltus.geo import Site
+
+__all__ = ["write_report"]
+
+MAX_ROWS = 2000  # tracks listed in the table
+_SCRIPTS = ("base.js", "plan.js", "pointer.js", "timeline.js", "panels.js", "main.js")
+_PLACED = ("inputs", "noise", "problems", "version")  # keys of the summary with a place of their own
+
+
+def write_report(
+    path: Path,
+    *,
+    tracks: "pa.Table",
+    plots: Plots,
+    assignments: "pa.Table",
+    innovations: "pa.Table",
+    summary: Mapping[str, object],
+    sites: Mapping[str, "Site"],
+) -> None:
+    """Write one self-contained HTML page; it needs no network and appears whole or not at all.
+
+    Args:
+        path: file to write.
+        tracks: the columns of `tracks.parquet`, any order of rows.
+        plots: every target report read, rejected ones included.
+        assignments: the columns of `assignments.parquet`; matched with `plots` by file, category and record.
+        innovations: one row per update: `track_id`, `time`, `source` (text), centre of the gate `latitude`,
+            `longitude` (degrees), its three-sigma half widths `gate_e`, `gate_n` (m, east and north), `nis`, `dof`.
+        summary: what `summary.json` holds. `inputs` (file names), `noise` (per source) and `problems` (lines) have
+            their own places; every other key is laid out as it comes.
+        sites: sensors' places by designation (`CAT048:20/129`) or name.
+
+    Raises:
+        DataError: `path` is a directory.
+        OSError: the page cannot be written.
+    """
+    updates = read_updates(tracks)
+    drawn, notes = payload(updates, plots, assignments, innovations, sites)
+    jumping, busiest = groups(updates.rows)
+    drawn |= {
+        "colours": {"p": colour_map(PROBABILITY_ENDS), "height": colour_map(HEIGHT_ENDS)},
+        "groups": {"manoeuvring": jumping, "busiest": busiest},
+    }
+    page = _template().render(
+        **_assets(),
+        data=_script_json(drawn),
+        ramp=drawn["colours"],
+        notes=notes,
+        **_header(plots, assignments, updates, summary),
+        **_tables(updates, assignments, innovations, summary),
+    )
+    with output_file(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+
+
+def _template() -> "jinja2.Template":
+    import jinja2
+
+    source = files("saltus.report").joinpath("template.html.j2").read_text(encoding="utf-8")
+    frame = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    frame.filters |= {"show": show, "clock": _clock, "lasting": _lasting}
+    return frame.from_string(source)
+
+
+def _assets() -> dict[str, object]:
+    """Return style and script, which are ours and go in unescaped."""
+    from markupsafe import Markup
+
+    folder = files("saltus.report")
+    script = "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in _SCRIPTS)
+    return {"style": Markup(folder.joinpath("report.css").read_text(encoding="utf-8")), "script": Markup(script)}
+
+
+def _script_json(value: object) -> object:
+    """Write JSON that cannot end the script element it stands in, whatever the strings are."""
+    from markupsafe import Markup
+
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    for character in "<>&\u2028\u2029":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return Markup(text)
+
+
+def _header(
+    plots: Plots, assignments: "pa.Table", updates: Updates, summary: Mapping[str, object]
+) -> dict[str, object]:
+    inputs = summary.get("inputs")
+    names = [Path(str(n)).name for n in inputs] if isinstance(inputs, Sequence) and not isinstance(inputs, str) else []
+    names = names or [Path(n).name for n in plots.files]
+    counts = reason_rows(assignments)
+    read = sum(n for _, n, _ in counts)
+    used = counts[0][1] if counts else 0
+    n_confirmed = sum(row.confirmed for row in updates.rows)
+    figures = [
+        ("Target reports read", show(read), ""),
+        ("On a track", show(used), f"{used / read:.1%}" if read else ""),
+        ("Rejected or unused", show(read - used), f"{(read - used) / read:.1%}" if read else ""),
+        ("Confirmed tracks", show(n_confirmed), f"of {show(len(updates.rows))} started"),
+        ("Systems", show(len(plots.sources)), ""),
+    ]
+    span = time_span(plots, updates)
+    return {
+        "heading": ", ".join(names) if 0 < len(names) <= 2 else f"{len(names)} recordings" if names else "No recording",
+        "inputs": names,
+        "systems": [f"{s.system} {s.system.name}".strip() for s in plots.sources],
+        "span": _span(*span) if span else "",
+        "figures": figures,
+        "version": version("saltus"),
+    }
+
+
+def _tables(
+    updates: Updates, assignments: "pa.Table", innovations: "pa.Table", summary: Mapping[str, object]
+) -> dict[str, object]:
+    confirmed = [row for row in updates.rows if row.confirmed]
+    problems = summary.get("problems") or ()
+    run: list[Block] = []
+    for key, value in summary.items():
+        if key not in _PLACED:
+            run += blocks(str(key), value)
+    return {
+        "reasons": reason_rows(assignments),
+        "noise": blocks("noise", summary["noise"]) if summary.get("noise") else [],
+        "innovations": innovation_rows(innovations),
+        "rows": confirmed[:MAX_ROWS],
+        "n_confirmed": len(confirmed),
+        "index": {row.id: k for k, row in enumerate(updates.rows)},
+        "problems": [problems] if isinstance(problems, str) else [show(p) for p in _listed(problems)],
+        "run": run,
+        "title": title,
+    }
+
+
+def _listed(value: object) -> Sequence[object]:
+    return value if isinstance(value, Sequence) else [value]
+
+
+def _clock(seconds: float) -> str:
+    return f"{_moment(seconds):%H:%M:%S}" if np.isfinite(seconds) else "–"
+
+
+def _moment(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def _lasting(seconds: float) -> str:
+    if not np.isfinite(seconds):
+        return "–"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+def _span(start: float, end: float) -> str:
+    a, b = _moment(start), _moment(end)
+    day = f"{a.day} {a:%B %Y}"
+    until = f"{b:%H:%M:%S}" if a.date() == b.date() else f"{b.day} {b:%B %Y} {b:%H:%M:%S}"
+    return f"{day}, {a:%H:%M:%S} – {until} UTC"
