@@ -1,1 +1,1 @@
-"""Package under construction."""
+"""Many objects: association, lifecycle, the tracker's loop, estimation of the sensors' noise."""

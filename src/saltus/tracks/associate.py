@@ -1,0 +1,80 @@
+"""Which plot belongs to which track: coarse gates by a tree, then an assignment within each cluster."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Pairs", "assign", "near_pairs"]
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.intp]
+
+
+class Pairs(NamedTuple):
+    """Candidate pairs: positions in the lists of tracks and plots they were made from."""
+
+    track: _Index  # (P,)
+    plot: _Index  # (P,)
+
+
+def near_pairs(tracks: _Array, reach: _Array, plots: _Array) -> Pairs:
+    """Return all pairs with |track - plot| <= reach of the track.
+
+    Args:
+        tracks: plane positions, (K, 2), m.
+        reach: radius about each, (K,), m.
+        plots: plane positions, (N, 2), m.
+    """
+    from scipy.spatial import cKDTree
+
+    if not len(tracks) or not len(plots):
+        empty = np.zeros(0, np.intp)
+        return Pairs(empty, empty)
+    found = cKDTree(plots).query_ball_point(tracks, reach)
+    counts = np.array([len(f) for f in found])
+    return Pairs(np.repeat(np.arange(len(tracks)), counts), np.concatenate([np.asarray(f, np.intp) for f in found]))
+
+
+def assign(pairs: Pairs, gain: _Array) -> _Index:
+    """Return the indices of the pairs chosen: each track and each plot at most once, total gain greatest.
+
+    Pairs of gain <= 0 are never chosen. Pairs that compete with no other are taken at once; the rest is solved
+    cluster by cluster (connected components of the gates).
+
+    Args:
+        pairs: candidates.
+        gain: log-likelihood ratio of each pair against leaving both alone, (P,), nats.
+    """
+    good = np.flatnonzero(gain > 0.0)
+    track, plot = pairs.track[good], pairs.plot[good]
+    alone = (np.bincount(track)[track] == 1) & (np.bincount(plot)[plot] == 1) if len(good) else np.zeros(0, bool)
+    chosen = [good[alone]]
+    contested = good[~alone]
+    if len(contested):
+        chosen.extend(_solve(pairs, gain, contested))
+    return np.concatenate(chosen)
+
+
+def _solve(pairs: Pairs, gain: _Array, contested: _Index) -> list[_Index]:
+    from scipy.optimize import linear_sum_assignment
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    tracks, track_idx = np.unique(pairs.track[contested], return_inverse=True)
+    plots, plot_idx = np.unique(pairs.plot[contested], return_inverse=True)
+    size = len(tracks) + len(plots)
+    links = coo_array((np.ones(len(contested)), (track_idx, len(tracks) + plot_idx)), shape=(size, size))
+    _, label = connected_components(links, directed=False)
+    chosen = []
+    order = np.argsort(label[track_idx], kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(label[track_idx][order])) + 1):
+        rows, row = np.unique(track_idx[members], return_inverse=True)
+        cols, col = np.unique(plot_idx[members], return_inverse=True)
+        matrix = np.zeros((len(rows), len(cols)))  # 0 = both left alone
+        which = np.full(matrix.shape, -1)
+        matrix[row, col], which[row, col] = gain[contested[members]], contested[members]
+        r, c = linear_sum_assignment(matrix, maximize=True)
+        picked = which[r, c]
+        chosen.append(picked[picked >= 0])
+    return chosen

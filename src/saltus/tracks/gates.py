@@ -1,0 +1,157 @@
+"""Gates: which plots of a slice may belong to which tracks."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.tracks.associate import Pairs, near_pairs
+from saltus.tracks.identity import conflicting
+from saltus.tracks.kinematics import Kinematics, Moments, Plan
+from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
+from saltus.tracks.measurements import Measurements
+from saltus.tracks.settings import FilterSettings, TrackerSettings
+
+__all__ = ["Gate", "Gated"]
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.intp]
+
+_POSITION, _VELOCITY = np.array([0, 2, 4]), np.array([1, 3, 5])
+_FAULT_GATE = 0.99
+_LATEST = -2.0  # s: how far a plot may lie before its track's last update
+
+
+class Gated(NamedTuple):
+    """Pairs inside their gates, with a copy of each pair's track moved to the plot's time."""
+
+    pairs: Pairs  # rows of the bank, positions in the slice
+    plan: Plan  # the measurement of each pair, its height removed where it fell outside
+    centre: _Array  # (P, 2), predicted measurement
+    gate_cov: _Array  # (P, 2, 2), innovation covariance of the most agile mode: the gate
+    d2: _Array  # (P,), horizontal squared Mahalanobis distance to the mixture's prediction
+    height_used: npt.NDArray[np.bool_]  # (P,)
+    fault: npt.NDArray[np.int8]  # (P,): 0 none, 1 azimuth, 2 range
+    copies: Kinematics
+    copy: _Index  # (P,): row of each pair among the copies
+
+
+class Gate:
+    """Chi-square gates at a stated probability: horizontal (2 degrees of freedom) and height (1).
+
+    The gate is that of the most agile mode, so that a manoeuvre begun since the last plot stays inside; which mode
+    explains the plot is for the likelihoods to say.
+    """
+
+    def __init__(self, settings: TrackerSettings, filters: FilterSettings, *, use_identity: bool) -> None:
+        """Fix thresholds from the settings."""
+        from scipy.stats import chi2
+
+        self.horizontal = float(chi2.ppf(settings.gate_probability, 2))
+        self.height = float(chi2.ppf(settings.gate_probability, 1))
+        self.fault = float(chi2.ppf(_FAULT_GATE, 2))
+        self._outlier_azimuth = float(np.radians(settings.outlier_azimuth))
+        self._outlier_range = settings.outlier_range
+        self._accel = max(filters.accel_h)
+        self._use_identity = use_identity
+
+    def __call__(self, kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Index) -> Gated:
+        """Pair tracks with the plots `index` of a slice inside their gates."""
+        rows = life.rows()
+        near = self._coarse(kinematics.moments(rows), life, rows, m, index)
+        near = self._admissible(Pairs(rows[near.track], near.plot), life, m, index)
+        dt = m.time[index[near.plot]] - life.time[near.track]
+        offset = np.minimum(dt, 0.0)  # a plot of another source may come a little late
+        copies = kinematics.predicted(near.track, np.maximum(dt, 0.0))
+        every = np.arange(len(dt))
+        z, R = m.position[index[near.plot]], m.cov[index[near.plot]]
+        y, S = _measured(*copies.widest(every), offset, R)
+        d2_gate, d2_height = _distances(z - y, S)
+        in_gate = d2_gate <= self.horizontal
+        R, fault = self._faults(~in_gate & (life.status[near.track] == CONFIRMED), z - y, S, R, m, index[near.plot])
+        inside = np.flatnonzero(in_gate | (fault > 0))
+        mixture = copies.moments(every)
+        y_mixture, S_mixture = _measured(mixture.mean, mixture.cov, offset, R)
+        d2, _ = _distances(z - y_mixture, S_mixture)
+        height_used = np.isfinite(z[:, 2]) & (d2_height <= self.height)
+        z = z.copy()
+        z[~height_used, 2] = np.nan
+        return Gated(
+            Pairs(near.track[inside], near.plot[inside]),
+            Plan(z[inside], R[inside], offset[inside]),
+            y[inside, :2],
+            S[inside, :2, :2],
+            d2[inside],
+            height_used[inside],
+            fault[inside],
+            copies,
+            inside,
+        )
+
+    def _faults(
+        self, candidate: npt.NDArray[np.bool_], nu: _Array, S: _Array, R: _Array, m: Measurements, plot: _Index
+    ) -> tuple[_Array, npt.NDArray[np.int8]]:
+        """Explain plots outside the gate of a confirmed track by a faulty azimuth or range where that fits."""
+        fault = np.zeros(len(nu), np.int8)
+        at = np.flatnonzero(candidate & np.isfinite(m.ray[plot, 0]))
+        wide = m.faulty(plot[at], self._outlier_azimuth, self._outlier_range)
+        S_fault = (S[at] - R[at])[:, None] + wide
+        d2 = np.stack([_distances(nu[at], S_fault[:, k])[0] for k in (0, 1)], axis=-1)
+        log_f = -0.5 * (d2 + np.log(np.linalg.det(S_fault[..., :2, :2])))
+        best = log_f.argmax(-1)
+        row = np.arange(len(at))
+        fits = d2[row, best] <= self.fault
+        fault[at[fits]] = 1 + best[fits]
+        R = R.copy()
+        R[at[fits]] = wide[row, best][fits]
+        return R, fault
+
+    def _coarse(self, moments: Moments, life: Lifecycle, rows: _Index, m: Measurements, index: _Index) -> Pairs:
+        """Pair by a radius that no plot inside the gate can exceed."""
+        middle, half = _span(m.time[index])
+        dt = np.maximum(middle - life.time[rows], 0.0)
+        longest = dt + half
+        velocity, cov = moments.mean[:, _VELOCITY[:2]], moments.cov
+        position = moments.mean[:, _POSITION[:2]] + dt[:, None] * velocity
+        variance = cov[:, 0, 0] + cov[:, 2, 2] + longest**2 * (cov[:, 1, 1] + cov[:, 3, 3])
+        variance += 2.0 * longest * np.abs(cov[:, 0, 1] + cov[:, 2, 3])
+        variance += 0.5 * (self._accel * longest**2) ** 2
+        variance += float(np.trace(m.cov[index, :2, :2], axis1=1, axis2=2).max())
+        reach = np.sqrt(self.horizontal * variance) + np.hypot(velocity[:, 0], velocity[:, 1]) * half
+        far = np.nan_to_num(np.hypot(m.ray[index, 0], m.ray[index, 1])).max()
+        astray = np.sqrt(self.fault) * np.hypot(self._outlier_range, self._outlier_azimuth * far)
+        reach = reach + np.where(life.status[rows] == CONFIRMED, astray, 0.0)
+        return near_pairs(position, reach, m.position[index, :2])
+
+    def _admissible(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> Pairs:
+        """Drop pairs of contradicting addresses, and plots too old for the track."""
+        plot = index[pairs.plot]
+        dt = m.time[plot] - life.time[pairs.track]
+        keep = np.where(life.status[pairs.track] == SEED, dt > 0.0, dt > _LATEST)
+        if self._use_identity:
+            keep &= ~conflicting(life.icao24[pairs.track], m.icao24[plot])
+        return Pairs(pairs.track[keep], pairs.plot[keep])
+
+
+def _span(time: _Array) -> tuple[float, float]:
+    return 0.5 * float(time[0] + time[-1]), 0.5 * float(time[-1] - time[0])
+
+
+def _measured(mean: _Array, P: _Array, offset: _Array, R: _Array) -> tuple[_Array, _Array]:
+    """Return the measurement predicted `offset` seconds from the rows' time, and its innovation covariance."""
+    t = offset[:, None, None]
+    pp, pv, vv = (
+        P[:, _POSITION[:, None], _POSITION],
+        P[:, _POSITION[:, None], _VELOCITY],
+        P[:, _VELOCITY[:, None], _VELOCITY],
+    )
+    y = mean[:, _POSITION] + offset[:, None] * mean[:, _VELOCITY]
+    return y, pp + t * (pv + pv.swapaxes(-1, -2)) + t * t * vv + R
+
+
+def _distances(nu: _Array, S: _Array) -> tuple[_Array, _Array]:
+    """Return the squared Mahalanobis distances of plane position and of height."""
+    det = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
+    a, b = nu[:, 0], nu[:, 1]
+    d2 = (S[:, 1, 1] * a * a - 2.0 * S[:, 0, 1] * a * b + S[:, 0, 0] * b * b) / det
+    return d2, np.nan_to_num(nu[:, 2] ** 2 / S[:, 2, 2], nan=np.inf)

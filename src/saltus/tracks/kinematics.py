@@ -1,0 +1,203 @@
+"""The filters of all tracks as rows: horizontal and vertical side by side, or jointly in three dimensions."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.filters import Bank, Belief
+from saltus.models import Chain, Motion, constant_velocity
+from saltus.tracks.settings import FilterSettings
+
+__all__ = ["Channel", "Kinematics", "Moments", "Plan", "Start", "make_kinematics", "two_point_start"]
+
+_Array = npt.NDArray[np.float64]
+_Rows = npt.NDArray[np.intp]
+
+
+class Moments(NamedTuple):
+    """What is published of a row: state (x, vx, y, vy, z, vz), its covariance, probabilities of manoeuvre."""
+
+    mean: _Array  # (k, 6)
+    cov: _Array  # (k, 6, 6)
+    p_manoeuvre_h: _Array  # (k,)
+    p_manoeuvre_v: _Array  # (k,)
+
+
+class Plan(NamedTuple):
+    """Position measurements for rows: x, y, altitude (NaN unknown), covariance, time offset to the row."""
+
+    position: _Array  # (k, 3)
+    cov: _Array  # (k, 3, 3)
+    offset: _Array  # (k,) s, <= 0: how far the measurement lies before the row's time
+
+
+class Start(NamedTuple):
+    """Where rows begin: state (k, 6) with covariance (k, 6, 6)."""
+
+    mean: _Array
+    cov: _Array
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A bank of multimode filters over some axes of space (0 x, 1 y, 2 z), constant velocity along each."""
+
+    axes: npt.NDArray[np.intp]
+    chains: tuple[Chain, ...]
+    motion: Motion  # bound to the chains
+    bank: Bank
+
+    @property
+    def states(self) -> npt.NDArray[np.intp]:
+        """Positions of the channel's states among the six."""
+        return np.stack([2 * self.axes, 2 * self.axes + 1], axis=-1).ravel()
+
+    def belief(self, start: Start) -> Belief:
+        """Give every mode the same Gaussian, and the chains their stationary law."""
+        k, n, sizes = len(start.mean), len(self.states), self.bank.sizes
+        log_probs = np.zeros(sizes)
+        for c, chain in enumerate(self.chains):
+            log_probs = log_probs + np.log(chain.law).reshape([-1 if i == c else 1 for i in range(len(sizes))])
+        lift = (k, *(1 for _ in sizes))
+        mean = start.mean[:, self.states].reshape((*lift, n))
+        cov = start.cov[:, self.states[:, None], self.states].reshape((*lift, n, n))
+        return Belief(
+            np.broadcast_to(log_probs, (k, *sizes)),
+            np.broadcast_to(mean, (k, *sizes, n)),
+            np.broadcast_to(cov, (k, *sizes, n, n)),
+        )
+
+    def predicted(self, rows: _Rows, dt: _Array) -> "Channel":
+        """Copies of rows, numbered from 0, mixed and moved forward by dt."""
+        ahead = self.bank.take(rows)
+        F, Q, _ = self.motion.step(dt)
+        trans = [None if len(chain) == 1 else chain.transition(dt) for chain in self.chains]
+        ahead.step(np.arange(len(rows)), trans, F, None, Q)
+        return replace(self, bank=ahead)
+
+    def update(self, rows: _Rows, plan: Plan) -> tuple[_Array, _Array]:
+        """Condition rows on the measured axes; return d2 and log-likelihood."""
+        m, ones = len(self.axes), tuple(1 for _ in self.bank.sizes)
+        H = np.zeros((len(rows), m, 2 * m))
+        H[:, np.arange(m), 2 * np.arange(m)] = 1.0
+        H[:, np.arange(m), 2 * np.arange(m) + 1] = plan.offset[:, None]
+        R = plan.cov[:, self.axes[:, None], self.axes]
+        lift = (len(rows), *ones)
+        return self.bank.update(
+            rows, plan.position[:, self.axes], H.reshape((*lift, m, 2 * m)), None, R.reshape((*lift, m, m))
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Kinematics:
+    """The rows of all tracks; every channel numbers them alike.
+
+    Two channels, horizontal and vertical, are the decomposition of the radar notes (their equations 16-25): the
+    covariance of height with horizontal position is dropped. One channel keeps it.
+    """
+
+    channels: tuple[Channel, ...]
+
+    def add(self, start: Start) -> _Rows:
+        """Store new rows."""
+        first, *others = [channel.bank.add(channel.belief(start)) for channel in self.channels]
+        for rows in others:
+            np.testing.assert_array_equal(rows, first)  # banks used alike recycle rows alike
+        return first
+
+    def write(self, rows: _Rows, start: Start) -> None:
+        """Begin rows anew."""
+        for channel in self.channels:
+            channel.bank.write(rows, channel.belief(start))
+
+    def remove(self, rows: _Rows) -> None:
+        """Free rows."""
+        for channel in self.channels:
+            channel.bank.remove(rows)
+
+    def predicted(self, rows: _Rows, dt: _Array) -> "Kinematics":
+        """Copies of rows (repeats allowed), numbered from 0, moved forward by dt >= 0."""
+        return Kinematics(tuple(channel.predicted(rows, dt) for channel in self.channels))
+
+    def update(self, rows: _Rows, plan: Plan) -> _Array:
+        """Condition rows on measurements; return their log-likelihood."""
+        return np.asarray(sum(channel.update(rows, plan)[1] for channel in self.channels))
+
+    def widest(self, rows: _Rows) -> tuple[_Array, _Array]:
+        """Mean and covariance of the most agile mode of every channel: what a gate must not cut off."""
+        mean, cov = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6))
+        for channel in self.channels:
+            s = channel.states
+            belief = channel.bank.read(rows)
+            last = (slice(None), *(-1 for _ in channel.chains))
+            mean[:, s], cov[:, s[:, None], s] = belief.means[last], belief.covs[last]
+        return mean, cov
+
+    def put(self, rows: _Rows, other: "Kinematics", other_rows: _Rows) -> None:
+        """Overwrite rows with those of a set of copies."""
+        for mine, theirs in zip(self.channels, other.channels, strict=True):
+            mine.bank.put(rows, theirs.bank, other_rows)
+
+    def moments(self, rows: _Rows) -> Moments:
+        """Mean, covariance, and the probability of any state but the first of each chain."""
+        mean, cov = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6))
+        p_manoeuvre = {}
+        for channel in self.channels:
+            s = channel.states
+            mean[:, s], cov[:, s[:, None], s], probs = channel.bank.moments(rows)
+            for c, chain in enumerate(channel.chains):
+                others = tuple(1 + i for i in range(len(channel.chains)) if i != c)
+                p_manoeuvre[chain.name] = 1.0 - probs.sum(axis=others)[:, 0]
+        return Moments(mean, cov, p_manoeuvre["horizontal"], p_manoeuvre["vertical"])
+
+
+def make_kinematics(settings: FilterSettings) -> Kinematics:
+    """Build the empty filters that the settings describe."""
+    h = _chain("horizontal", settings.accel_h, settings.sojourn_h)
+    v = _chain("vertical", settings.accel_v, settings.sojourn_v)
+    if settings.form == "joint":
+        motion = constant_velocity(3, accel=lambda horizontal, vertical: [horizontal, horizontal, vertical])
+        return Kinematics((_channel([0, 1, 2], (h, v), motion),))
+    horizontal = constant_velocity(2, accel=lambda horizontal: horizontal)
+    vertical = constant_velocity(1, accel=lambda vertical: vertical)
+    return Kinematics((_channel([0, 1], (h,), horizontal), _channel([2], (v,), vertical)))
+
+
+def _chain(name: str, accel: tuple[float, ...], sojourn: tuple[float, ...]) -> Chain:
+    if len(accel) == 1:
+        return Chain(name, {"steady": accel[0]}, trans=[[1.0]])
+    labels = ["steady", *(f"manoeuvre{i}" for i in range(1, len(accel)))]
+    return Chain(name, dict(zip(labels, accel, strict=True)), sojourn=dict(zip(labels, sojourn, strict=True)))
+
+
+def _channel(axes: list[int], chains: tuple[Chain, ...], motion: Motion) -> Channel:
+    bank = Bank(2 * len(axes), tuple(len(chain) for chain in chains))
+    return Channel(np.array(axes), chains, motion.bind(chains), bank)
+
+
+def two_point_start(first: _Array, first_cov: _Array, second: _Array, second_cov: _Array, dt: _Array) -> Start:
+    """Begin states from two positions.
+
+    Position z1, velocity (z1 - z0)/T, and blockwise over (position, velocity) P = [[R1, R1/T], [R1/T, (R0 + R1)/T^2]].
+
+    Args:
+        first: positions (x, y, z) at the earlier time, (k, 3).
+        first_cov: their covariances R0, (k, 3, 3).
+        second: positions at the later time, (k, 3).
+        second_cov: their covariances R1, (k, 3, 3).
+        dt: time between them T > 0, (k,), s.
+
+    Returns:
+        States (x, vx, y, vy, z, vz) at the later time.
+
+    Source: two-point differencing; section 3 of the radar notes.
+    """
+    T = dt[:, None, None]
+    mean, cov = np.empty((len(dt), 6)), np.empty((len(dt), 6, 6))
+    mean[:, 0::2], mean[:, 1::2] = second, (second - first) / dt[:, None]
+    cov[:, 0::2, 0::2] = second_cov
+    cov[:, 0::2, 1::2] = cov[:, 1::2, 0::2] = second_cov / T
+    cov[:, 1::2, 1::2] = (first_cov + second_cov) / (T * T)
+    return Start(mean, cov)

@@ -1,0 +1,114 @@
+"""Birth, confirmation, coasting and death of tracks: one array element per bank row."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.tracks.settings import TrackerSettings
+
+__all__ = ["COASTED", "CONFIRMED", "NO_CODE", "SEED", "STATUS", "TENTATIVE", "Birth", "Lifecycle"]
+
+_Array = npt.NDArray[np.float64]
+_Rows = npt.NDArray[np.intp]
+
+SEED, TENTATIVE, CONFIRMED, COASTED = 0, 1, 2, 3
+STATUS = ("tentative", "tentative", "confirmed", "coasted")
+NO_CODE = -1
+_SLACK = 0.6  # of a period: how late a plot may come before it counts as missed
+
+
+class Birth(NamedTuple):
+    """What a new track takes over from its first plot."""
+
+    time: _Array
+    period: _Array
+    plot: npt.NDArray[np.intp]
+
+
+class Lifecycle:
+    """Identity number, status, plot history and codes of every track; row numbers are the bank's."""
+
+    def __init__(self, settings: TrackerSettings) -> None:
+        """Make an empty table."""
+        self._settings = settings
+        self._next_id = 1
+        self.active = np.zeros(0, bool)
+        self.id = np.zeros(0, np.int64)
+        self.status = np.zeros(0, np.int8)
+        self.time = np.zeros(0)  # of the last update, s
+        self.period = np.zeros(0)  # shortest update period of the sources that saw the track, s
+        self.history = np.zeros(0, np.uint64)  # bit k: a plot k expected scans ago
+        self.coasted = np.zeros(0, np.int64)  # coasted rows published since the last update
+        self.has_altitude = np.zeros(0, bool)
+        self.icao24 = np.zeros(0, np.int32)
+        self.mode3a = np.zeros(0, np.int16)
+        self.plot = np.zeros(0, np.intp)  # last plot, as measurement index
+        self.named = np.zeros(0, np.intp)  # last plot with a callsign, as measurement index, -1 none
+
+    def rows(self) -> _Rows:
+        """Return the rows in use."""
+        return np.flatnonzero(self.active)
+
+    def begin(self, rows: _Rows, birth: Birth) -> None:
+        """Start tracks of one plot in rows just added to the bank."""
+        self._reserve(int(rows.max()) + 1 if len(rows) else 0)
+        self.active[rows] = True
+        self.id[rows] = self._next_id + np.arange(len(rows))
+        self._next_id += len(rows)
+        self.status[rows] = SEED
+        self.time[rows], self.period[rows], self.plot[rows] = birth
+        self.history[rows] = 1
+        self.coasted[rows] = 0
+        self.has_altitude[rows] = False
+        self.icao24[rows] = self.mode3a[rows] = self.named[rows] = NO_CODE
+
+    def hit(self, rows: _Rows, time: _Array, period: _Array, plot: npt.NDArray[np.intp]) -> None:
+        """Enter a plot for each row; confirm what has M plots of the last N expected."""
+        settings = self._settings
+        self.period[rows] = np.minimum(self.period[rows], period)
+        scans = np.rint((time - self.time[rows]) / self.period[rows])
+        shift = np.clip(scans, 1, 63).astype(np.uint64)
+        self.history[rows] = (self.history[rows] << shift) | np.uint64(1)
+        window = np.uint64((1 << settings.confirm_scans) - 1)
+        hits = np.bitwise_count(self.history[rows] & window)
+        enough = hits >= settings.confirm_hits
+        self.status[rows] = np.where(enough | (self.status[rows] == CONFIRMED), CONFIRMED, TENTATIVE)
+        self.time[rows] = np.maximum(self.time[rows], time)
+        self.coasted[rows] = 0
+        self.plot[rows] = plot
+
+    def overdue(self, now: float) -> _Rows:
+        """Return the rows that have missed too much by `now`: coasted out, or not confirmable any more."""
+        settings, rows = self._settings, self.rows()
+        patience = (settings.confirm_scans - settings.confirm_hits + 1) * self.period[rows]
+        limit = np.where(self.status[rows] == CONFIRMED, self._coast_limit(rows), patience)
+        return rows[now - self.time[rows] > limit + _SLACK * self.period[rows]]
+
+    def to_coast(self, now: float) -> tuple[_Rows, _Array]:
+        """Count and return confirmed rows that missed one more plot by `now`, and the time it was expected."""
+        rows = self.rows()
+        rows = rows[self.status[rows] == CONFIRMED]
+        wait = (self.coasted[rows] + 1) * self.period[rows]
+        late = (now - self.time[rows] > wait + _SLACK * self.period[rows]) & (wait <= self._coast_limit(rows))
+        rows, expected = rows[late], (self.time[rows] + wait)[late]
+        self.coasted[rows] += 1
+        return rows, expected
+
+    def _coast_limit(self, rows: _Rows) -> _Array:
+        return np.maximum(self._settings.coast_scans * self.period[rows], self._settings.coast_seconds)
+
+    def end(self, rows: _Rows) -> None:
+        """Forget rows."""
+        self.active[rows] = False
+
+    def _reserve(self, size: int) -> None:
+        old = len(self.active)
+        if size <= old:
+            return
+        grown = max(size, 2 * old, 64)
+        for name, column in vars(self).items():
+            if isinstance(column, np.ndarray):
+                bigger = np.zeros(grown, column.dtype)
+                bigger[:old] = column
+                setattr(self, name, bigger)

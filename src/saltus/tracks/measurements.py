@@ -1,0 +1,229 @@
+"""Reports as positions with covariances in the tracker's plane."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.errors import DataError
+from saltus.geo import (
+    Plane,
+    PlanePositions,
+    Site,
+    geodetic_to_plane,
+    local_to_plane,
+    polar_to_plane,
+    spherical_to_plane,
+)
+from saltus.records import Kind, Plots, Source
+
+__all__ = ["Measurements", "Noise", "default_noise", "make_plane", "place_plots"]
+
+_Array = npt.NDArray[np.float64]
+
+# Where nothing is configured and nothing could be estimated: a monopulse secondary radar, an airport
+# multilateration, ADS-B with good satellite navigation, heights in steps of 100 ft.
+_RANGE, _AZIMUTH, _ELEVATION, _XY, _ALTITUDE = 50.0, np.radians(0.08), np.radians(0.3), 20.0, 10.0
+_SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Standard deviations of one source's measurements: m and rad."""
+
+    range: float = _RANGE
+    azimuth: float = float(_AZIMUTH)
+    elevation: float = float(_ELEVATION)
+    xy: float = _XY
+    altitude: float = _ALTITUDE
+
+
+def default_noise(source: Source) -> Noise:
+    """Return the noise to start from, never below the source's quantisation, LSB / sqrt(12)."""
+    step = np.sqrt(12.0)
+    return replace(
+        Noise(),
+        range=max(_RANGE, source.range_lsb / step),
+        azimuth=float(max(_AZIMUTH, source.azimuth_lsb / step)),
+        xy=max(_XY, source.xy_lsb / step),
+        altitude=max(_ALTITUDE, source.altitude_lsb / step),
+    )
+
+
+class Measurements(NamedTuple):
+    """Usable reports in time order; `plot` is their index in the recording's plots."""
+
+    plot: npt.NDArray[np.intp]  # (N,)
+    time: _Array  # (N,), s
+    source: npt.NDArray[np.int32]  # (N,)
+    position: _Array  # (N, 3): plane x, y and altitude, m; altitude NaN where unknown
+    cov: _Array  # (N, 3, 3), m^2; row and column of an unknown altitude are those of the unit matrix
+    icao24: npt.NDArray[np.int32]
+    mode3a: npt.NDArray[np.int16]
+    named: npt.NDArray[np.bool_]  # whether the report gives a callsign
+    polar: _Array  # (N, 2): slant range (m) and azimuth (rad) where the source measures them, else NaN
+    ray: _Array  # (N, 2): from the site to the position in the plane, m; NaN where the source is not polar
+    lever: _Array  # (N, 2): change of plane position per metre of height error, 0 where none
+
+    def __len__(self) -> int:  # a NamedTuple counts its fields otherwise
+        """Number of measurements."""
+        return len(self.time)
+
+    def take(self, index: npt.NDArray[np.intp]) -> "Measurements":
+        """Return the measurements selected."""
+        return Measurements(*(column[index] for column in self))
+
+    def with_height(self, index: npt.NDArray[np.intp], prior: tuple[float, float]) -> tuple[_Array, _Array]:
+        """Return positions (k, 3) and covariances, heights unknown replaced by their prior (mean, sd)."""
+        position, cov = self.position[index].copy(), self.cov[index].copy()
+        unknown = np.isnan(position[:, 2])
+        position[unknown, 2], cov[unknown, 2, 2] = prior[0], prior[1] ** 2
+        return position, cov
+
+    def faulty(self, index: npt.NDArray[np.intp], sigma_azimuth: float, sigma_range: float) -> _Array:
+        """Return covariances (k, 2, 3, 3) of plots with a faulty azimuth, and with a faulty range.
+
+        R + sigma_azimuth^2 c c' and R + sigma_range^2 u u', u the unit vector from the site and c the vector of
+        the same length as the ground range across it. NaN where the source is not polar.
+        """
+        ray = self.ray[index]
+        across = np.stack([-ray[:, 1], ray[:, 0]], axis=-1) * sigma_azimuth
+        along = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * sigma_range
+        shift = np.stack([across, along], axis=1)
+        cov = np.repeat(self.cov[index][:, None], 2, axis=1)
+        cov[..., :2, :2] += shift[..., :, None] * shift[..., None, :]
+        return cov
+
+    def split_from(
+        self, left: npt.NDArray[np.intp], used: npt.NDArray[np.intp], max_range: float, max_azimuth: float
+    ) -> npt.NDArray[np.bool_]:
+        """Say which plots left over are second plots of a target seen in the same scan.
+
+        Args:
+            left: plots without a track, (k,).
+            used: plots of the same source and scan that updated a confirmed track, (l,).
+            max_range: m, also the distance for sources that do not measure range.
+            max_azimuth: rad.
+        """
+        a, b = left[:, None], used[None, :]
+        d_range, d_azimuth = np.moveaxis(np.abs(self.polar[a] - self.polar[b]), -1, 0)
+        d_azimuth = np.minimum(d_azimuth, 2.0 * np.pi - d_azimuth)
+        distance = np.linalg.norm(self.position[a, :2] - self.position[b, :2], axis=-1)
+        near = np.where(np.isnan(d_range), distance < max_range, (d_range < max_range) & (d_azimuth < max_azimuth))
+        apart = np.abs(self.position[a, 2] - self.position[b, 2]) > _SAME_HEIGHT
+        for codes in (self.icao24, self.mode3a):
+            apart |= (codes[a] >= 0) & (codes[b] >= 0) & (codes[a] != codes[b])
+        return np.asarray((near & ~apart).any(axis=1))
+
+
+def make_plane(plots: Plots, sites: Sequence[Site | None]) -> Plane:
+    """Return the plane centred among the sites, or among the reports where no source has a site.
+
+    Raises:
+        DataError: there is neither a site nor a geodetic position.
+    """
+    known = [s for s in sites if s is not None]
+    if known:
+        return Plane(float(np.mean([s.latitude for s in known])), float(np.mean([s.longitude for s in known])))
+    at = (plots.kind == Kind.GEODETIC) & (plots.reason == 0)
+    if not at.any():
+        raise DataError(
+            "no report can be placed on the map: no source has a site position and none gives latitude and longitude. "
+            "Give each radar's site as [[sensor]] sac, sic, latitude, longitude, height in the configuration."
+        )
+    return Plane(float(np.median(plots.latitude[at])), float(np.median(plots.longitude[at])))
+
+
+def place_plots(
+    plots: Plots,
+    plane: Plane,
+    sites: Sequence[Site | None],
+    noise: Mapping[int, Noise],
+    height_prior: tuple[float, float],
+) -> Measurements:
+    """Turn usable reports (reason 0) into plane positions with covariances.
+
+    Args:
+        plots: reports in time order.
+        plane: the tracker's plane.
+        sites: site per source; reports of a source without a needed site must carry a reason already.
+        noise: per source index.
+        height_prior: mean and standard deviation of unknown heights, m.
+    """
+    usable = np.flatnonzero(plots.reason == 0)
+    n = len(usable)
+    position, cov = np.full((n, 3), np.nan), np.zeros((n, 3, 3))
+    lever, ray = np.zeros((n, 2)), np.full((n, 2), np.nan)
+    for s in range(len(plots.sources)):
+        for kind in (Kind.POLAR, Kind.PLANE, Kind.GEODETIC):
+            at = np.flatnonzero((plots.source[usable] == s) & (plots.kind[usable] == kind))
+            if len(at):
+                placed = _place(plots.take(usable[at]), kind, plane, sites[s], noise[s], height_prior)
+                _fill(position, cov, lever, at, placed)
+                site = sites[s]
+                if kind == Kind.POLAR and site is not None:
+                    ray[at] = placed.xy - plane.forward(site.latitude, site.longitude)
+    return Measurements(
+        plot=usable,
+        time=plots.time[usable],
+        source=plots.source[usable],
+        position=position,
+        cov=cov,
+        icao24=plots.icao24[usable],
+        mode3a=plots.mode3a[usable],
+        named=plots.callsign[usable] != "",
+        polar=np.stack([plots.range[usable], plots.azimuth[usable]], axis=-1),
+        ray=ray,
+        lever=lever,
+    )
+
+
+def _place(
+    plots: Plots, kind: int, plane: Plane, site: Site | None, noise: Noise, height_prior: tuple[float, float]
+) -> PlanePositions:
+    if kind == Kind.GEODETIC:
+        return geodetic_to_plane(plots.latitude, plots.longitude, plots.altitude, plane, noise.xy, noise.altitude)
+    if site is None:
+        raise DataError("internal: a report relative to an unknown site reached the tracker")
+    if kind == Kind.PLANE:
+        return local_to_plane(plots.x, plots.y, plots.altitude, site, plane, noise.xy, noise.altitude)
+    flat = polar_to_plane(
+        plots.range,
+        plots.azimuth,
+        plots.altitude,
+        site,
+        plane,
+        sigma_range=noise.range,
+        sigma_azimuth=noise.azimuth,
+        sigma_altitude=noise.altitude,
+        height_prior=height_prior,
+    )
+    measured = np.isfinite(plots.elevation)
+    if not measured.any():
+        return flat
+    solid = spherical_to_plane(
+        plots.range[measured],
+        plots.azimuth[measured],
+        plots.elevation[measured],
+        site,
+        plane,
+        sigma_range=noise.range,
+        sigma_azimuth=noise.azimuth,
+        sigma_elevation=noise.elevation,
+    )
+    for column, values in zip(flat, solid, strict=True):
+        column[measured] = values
+    return flat
+
+
+def _fill(position: _Array, cov: _Array, lever: _Array, at: npt.NDArray[np.intp], placed: PlanePositions) -> None:
+    """Write one source's positions into the columns of all."""
+    known = np.isfinite(placed.altitude)
+    position[at, :2], position[at, 2] = placed.xy, np.where(known, placed.altitude, np.nan)
+    cov[at, :2, :2] = placed.cov
+    cov[at, 2, 2] = np.where(known, placed.altitude_var, 1.0)
+    cross = np.where(known[:, None], placed.cross, 0.0)
+    cov[at, :2, 2] = cov[at, 2, :2] = cross
+    lever[at] = np.where(known[:, None], cross / np.maximum(cov[at, 2, 2], 1e-12)[:, None], 0.0)

@@ -1,0 +1,120 @@
+"""Published rows as tables: true north and east at the target, degrees where people read them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from saltus.geo import Plane
+from saltus.records import REASONS, Plots
+from saltus.tracks.lifecycle import STATUS
+from saltus.tracks.measurements import Measurements
+from saltus.tracks.tracker import Assignments, Rows
+
+__all__ = ["NOT_CONFIRMED", "SINGLE", "SPLIT", "assignment_table", "innovation_table", "track_table"]
+
+_Array = npt.NDArray[np.float64]
+
+SPLIT = "split plot"
+SINGLE = "single plot"  # no second plot near it
+NOT_CONFIRMED = "track not confirmed"
+
+
+def track_table(rows: Rows, plane: Plane, plots: Plots, m: Measurements, sigma_pressure: float) -> pa.Table:
+    """Return rows with the columns of tracks.parquet.
+
+    The error of pressure altitude as height moves a radar plot along its ray by `lever` metres per metre; it is the
+    same scan after scan, so no filter averages it out and it is added to the published covariance.
+    """
+    mean, cov = rows.moments.mean, rows.moments.cov.copy()
+    seen = rows.measurement >= 0
+    push = np.where(seen[:, None], m.lever[rows.measurement] * sigma_pressure, 0.0)
+    cov[:, 0:3:2, 0:3:2] += push[:, :, None] * push[:, None, :]
+    altitude = np.where(rows.has_altitude, mean[:, 4], np.nan)
+    true = plane.to_true(mean[:, :4], cov[:, :4, :4], altitude)
+    ve, vn = true.velocity.T
+    position, velocity = true.position_cov, true.velocity_cov
+    named = np.where(rows.named >= 0, plots.callsign[m.plot[rows.named]], "")
+    return pa.table(
+        {
+            "track_id": rows.track_id,
+            "time": rows.time,
+            "latitude": np.degrees(true.latitude),
+            "longitude": np.degrees(true.longitude),
+            "altitude": _null_nan(altitude),
+            "ve": ve,
+            "vn": vn,
+            "vu": _null_nan(np.where(rows.has_altitude, mean[:, 5], np.nan)),
+            "course_deg": np.degrees(np.arctan2(ve, vn)) % 360.0,
+            "speed_mps": np.hypot(ve, vn),
+            "cov_ee": position[:, 0, 0],
+            "cov_en": position[:, 0, 1],
+            "cov_nn": position[:, 1, 1],
+            "cov_uu": _null_nan(np.where(rows.has_altitude, cov[:, 4, 4], np.nan)),
+            "cov_veve": velocity[:, 0, 0],
+            "cov_vevn": velocity[:, 0, 1],
+            "cov_vnvn": velocity[:, 1, 1],
+            "p_manoeuvre_h": np.clip(rows.moments.p_manoeuvre_h, 0.0, 1.0),
+            "p_manoeuvre_v": np.clip(rows.moments.p_manoeuvre_v, 0.0, 1.0),
+            "status": pa.array(np.array(STATUS)[rows.status], pa.string()),
+            "icao24": pa.array([f"{c:06X}" if c >= 0 else None for c in rows.icao24], pa.string()),
+            "mode3a": pa.array([f"{c:04o}" if c >= 0 else None for c in rows.mode3a], pa.string()),
+            "callsign": pa.array([str(c) or None for c in named], pa.string()),
+        }
+    )
+
+
+def innovation_table(rows: Rows, plane: Plane, plots: Plots, m: Measurements) -> pa.Table:
+    """Return the gates of updated rows: centre, three-sigma half widths to true east and north, NIS."""
+    seen = np.flatnonzero(rows.measurement >= 0)
+    state, cov = np.zeros((len(seen), 4)), np.zeros((len(seen), 4, 4))
+    state[:, 0::2], cov[:, 0::2, 0::2] = rows.centre[seen], rows.gate_cov[seen]
+    true = plane.to_true(state, cov)
+    half = 3.0 * np.sqrt(np.diagonal(true.position_cov, axis1=-2, axis2=-1))
+    names = [str(s.system) for s in plots.sources]
+    return pa.table(
+        {
+            "track_id": rows.track_id[seen],
+            "time": rows.time[seen],
+            "source": pa.array([names[s] for s in m.source[rows.measurement[seen]]], pa.string()),
+            "latitude": np.degrees(true.latitude),
+            "longitude": np.degrees(true.longitude),
+            "gate_e": half[:, 0],
+            "gate_n": half[:, 1],
+            "nis": _null_nan(rows.d2[seen]),
+            "dof": np.full(len(seen), 2, np.int32),
+        }
+    )
+
+
+def assignment_table(plots: Plots, m: Measurements, assignments: Assignments) -> pa.Table:
+    """Return one row per target report read: the track it belongs to, or why none."""
+    track_id = np.zeros(len(plots), np.int64)
+    reason = np.array(REASONS, object)[plots.reason]
+    ids = assignments.track_id
+    kept = np.isin(ids, assignments.confirmed)
+    track_id[m.plot] = np.where(kept, ids, 0)
+    single = np.bincount(ids)[ids] == 1 if len(ids) else np.zeros(0, bool)
+    why = np.where(assignments.split, SPLIT, np.where(single, SINGLE, NOT_CONFIRMED))
+    reason[m.plot] = np.where(kept, "", why)
+    sources = np.array([-1 if s.system.category is None else s.system.category for s in plots.sources] or [-1])
+    category = sources[plots.source]
+    return pa.table(
+        {
+            "source": pa.array(_names(plots.files, plots.file), pa.string()),
+            "category": pa.array(category, pa.int32(), mask=category < 0),
+            "record": pa.array(plots.record, pa.int64()),
+            "time": _null_nan(plots.time),
+            "track_id": pa.array(track_id, pa.int64(), mask=track_id == 0),
+            "reason": pa.array([str(r) or None for r in reason], pa.string()),
+        }
+    )
+
+
+def _names(files: Sequence[str], index: npt.NDArray[np.int32]) -> list[str]:
+    return [files[i] for i in index]
+
+
+def _null_nan(values: _Array) -> pa.Array:
+    return pa.array(values, pa.float64(), from_pandas=True)

@@ -1,0 +1,111 @@
+"""What a user may set of the tracker; every field is a key of the configuration's [tracker] or [filter] table."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from saltus.errors import ModelError
+
+__all__ = ["FilterSettings", "TrackerSettings"]
+
+
+@dataclass(frozen=True, slots=True)
+class FilterSettings:
+    """The multimode filters of every track.
+
+    Modes are levels of acceleration, constant within a scan and independent between scans (sigma, m/s^2), the first
+    of them steady motion; each chain leaves a state after its mean sojourn.
+
+    Attributes:
+        form: "decomposed" runs a horizontal and a vertical filter side by side; "joint" one filter in three
+            dimensions with the product of the modes and the full covariance of each plot, which matters at short
+            range and high elevation.
+        accel_h: acceleration of each horizontal mode, m/s^2, steady first.
+        sojourn_h: mean stay in each horizontal mode, s.
+        accel_v: acceleration of each vertical mode, m/s^2.
+        sojourn_v: mean stay in each vertical mode, s.
+    """
+
+    form: Literal["decomposed", "joint"] = "decomposed"
+    accel_h: tuple[float, ...] = (0.15, 3.0)
+    sojourn_h: tuple[float, ...] = (120.0, 25.0)
+    accel_v: tuple[float, ...] = (0.1, 2.5)
+    sojourn_v: tuple[float, ...] = (90.0, 15.0)
+
+    def __post_init__(self) -> None:
+        """Refuse settings that describe no filter."""
+        if self.form not in ("decomposed", "joint"):
+            raise ModelError(f'filter.form is "decomposed" or "joint", not {self.form!r}.')
+        for axis in "hv":
+            accel, sojourn = getattr(self, f"accel_{axis}"), getattr(self, f"sojourn_{axis}")
+            if len(accel) != len(sojourn) or not accel:
+                raise ModelError(
+                    f"filter.accel_{axis} has {len(accel)} modes and filter.sojourn_{axis} has {len(sojourn)}; "
+                    "give one acceleration and one mean stay per mode."
+                )
+            if min(accel) <= 0 or min(sojourn) <= 0 or not np.all(np.isfinite(accel + sojourn)):
+                raise ModelError(f"filter.accel_{axis} and filter.sojourn_{axis} must be positive: m/s^2 and s.")
+            if list(accel) != sorted(accel):
+                raise ModelError(f"filter.accel_{axis} must ascend, steady motion first; got {accel}.")
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerSettings:
+    """Association, initiation and deletion.
+
+    Attributes:
+        gate_probability: probability that a target's own plot falls inside its gate.
+        detection_probability: probability that a target gives a plot in a scan.
+        clutter_density: false plots and new targets per m^2 and scan; a higher value makes the tracker prefer
+            leaving a distant plot alone to stretching a track.
+        max_speed: fastest target that may start a track, m/s.
+        confirm_hits, confirm_scans: a track is confirmed when it got `confirm_hits` plots in the last
+            `confirm_scans` expected ones (M of N).
+        coast_scans: a confirmed track is dropped after so many expected plots missed in a row, but not before
+            `coast_seconds`.
+        coast_seconds: shortest time a confirmed track coasts before it is dropped, s.
+        split_range: a plot left over within this range (m) and `split_azimuth` (degrees) of a plot of the same
+            source and scan that updated a confirmed track, with no other height or identity, is a split plot.
+        split_azimuth: see split_range.
+        altitude_outlier: probability that a plot's height is wrong (garbled Mode C); such a height is ignored.
+        plot_outlier: probability that a radar plot's azimuth, or its range, is faulty; a confirmed track that no
+            plot in its gate explains takes such a plot with the deviations below.
+        outlier_azimuth: standard deviation of a faulty azimuth, degrees.
+        outlier_range: standard deviation of a faulty range, m.
+        height_prior: mean and standard deviation of the height of targets that do not tell it, m.
+        sigma_pressure: error of pressure altitude as geometric height, m; widens the published covariance near
+            the radar, where height bends slant range.
+    """
+
+    gate_probability: float = 0.9999
+    detection_probability: float = 0.95
+    clutter_density: float = 1e-11
+    max_speed: float = 400.0
+    confirm_hits: int = 3
+    confirm_scans: int = 5
+    coast_scans: int = 5
+    coast_seconds: float = 20.0
+    split_range: float = 300.0
+    split_azimuth: float = 3.0
+    altitude_outlier: float = 1e-3
+    plot_outlier: float = 1e-3
+    outlier_azimuth: float = 1.5
+    outlier_range: float = 400.0
+    height_prior: tuple[float, float] = (5000.0, 3500.0)
+    sigma_pressure: float = 100.0
+
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot be."""
+        for name in ("gate_probability", "detection_probability", "altitude_outlier", "plot_outlier"):
+            value = getattr(self, name)
+            if not 0.0 < value < 1.0:
+                raise ModelError(f"tracker.{name} is a probability between 0 and 1, got {value}.")
+        if not 1 <= self.confirm_hits <= self.confirm_scans <= 32:
+            raise ModelError(
+                f"tracker.confirm_hits of confirm_scans (M of N) needs 1 <= M <= N <= 32, "
+                f"got {self.confirm_hits} of {self.confirm_scans}."
+            )
+        for name in ("clutter_density", "max_speed", "coast_scans", "coast_seconds", "split_range", "split_azimuth"):
+            if not getattr(self, name) > 0:
+                raise ModelError(f"tracker.{name} must be positive, got {getattr(self, name)}.")

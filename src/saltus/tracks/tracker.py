@@ -1,0 +1,248 @@
+"""The tracker's loop: slices of a scan in time order, all tracks of a slice as arrays."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.tracks.associate import assign
+from saltus.tracks.gates import Gate, Gated
+from saltus.tracks.identity import identity_gain
+from saltus.tracks.kinematics import Moments, Start, make_kinematics, two_point_start
+from saltus.tracks.lifecycle import COASTED, CONFIRMED, SEED, Birth, Lifecycle
+from saltus.tracks.measurements import Measurements
+from saltus.tracks.settings import FilterSettings, TrackerSettings
+
+__all__ = ["Assignments", "Rows", "Tracker"]
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.intp]
+
+_SLICE = 0.4  # of the shortest update period: a target gives a source at most one plot in a slice
+_LONGEST_SLICE = 2.0  # s
+_HEIGHT_SPAN = 15_000.0  # m: heights of clutter and new targets spread over this
+_CLIMB = 15.0  # m/s: standard deviation of the vertical speed of a new track
+_STANDING = np.array([-4.0, -2.0, 0.0])  # nats: a plot is less likely a seed's or a tentative track's own
+
+
+class Rows(NamedTuple):
+    """Published track rows, one array element each, in the tracker's plane."""
+
+    track_id: npt.NDArray[np.int64]
+    time: _Array
+    moments: Moments
+    status: npt.NDArray[np.int8]  # index into lifecycle.STATUS
+    has_altitude: npt.NDArray[np.bool_]
+    icao24: npt.NDArray[np.int32]
+    mode3a: npt.NDArray[np.int16]
+    named: _Index  # measurement that gave the callsign, -1 none
+    measurement: _Index  # measurement of the update, -1 where coasted
+    centre: _Array  # (k, 2): centre of the gate
+    gate_cov: _Array  # (k, 2, 2): innovation covariance
+    d2: _Array  # squared Mahalanobis distance of the horizontal innovation; NaN where there is none
+
+
+class Assignments(NamedTuple):
+    """What became of each measurement."""
+
+    track_id: npt.NDArray[np.int64]  # (N,), 0 = none
+    split: npt.NDArray[np.bool_]  # (N,): a second plot of a target already updated
+    confirmed: npt.NDArray[np.int64]  # ids of the tracks that were confirmed at some time
+
+
+class Tracker:
+    """Multimode multitarget tracker over measurements in time order."""
+
+    def __init__(
+        self,
+        settings: TrackerSettings,
+        filters: FilterSettings,
+        periods: Sequence[float],
+        *,
+        use_identity: bool,
+    ) -> None:
+        """Prepare an empty tracker.
+
+        Args:
+            settings: association, initiation and deletion.
+            filters: the filters of every track.
+            periods: update period of each source, s.
+            use_identity: let Mode S addresses decide and Mode 3/A codes support the association.
+        """
+        self._settings = settings
+        self._periods = np.asarray(periods, float)
+        self._use_identity = use_identity
+        self._kinematics = make_kinematics(filters)
+        self._life = Lifecycle(settings)
+        self._gate = Gate(settings, filters, use_identity=use_identity)
+        # The gate of a track of one plot, at rest with this deviation of speed, ends at the fastest target's.
+        self._seed_speed = settings.max_speed / np.sqrt(self._gate.horizontal)
+        sojourn = np.array(filters.sojourn_h)
+        self._mean_accel_sq = float(sojourn @ np.square(filters.accel_h) / sojourn.sum())
+        self._confirmed: list[npt.NDArray[np.int64]] = []
+
+    def run(
+        self,
+        measurements: Measurements,
+        emit: Callable[[Rows], None],
+        progress: Callable[[float], None] | None = None,
+    ) -> Assignments:
+        """Track all measurements.
+
+        Args:
+            measurements: in time order.
+            emit: receives the published rows, slice by slice.
+            progress: receives the share done, 0 to 1.
+        """
+        self._m, self._emit = measurements, emit
+        self._track_id = np.zeros(len(measurements), np.int64)
+        self._split = np.zeros(len(measurements), bool)
+        for begin, end in self._slices():
+            self._housekeep(float(measurements.time[begin]))
+            sources = measurements.source[begin:end]
+            for s in np.unique(sources):
+                self._scan(begin + np.flatnonzero(sources == s), float(self._periods[s]))
+            if progress is not None:
+                progress(end / len(measurements))
+        confirmed = np.concatenate([np.zeros(0, np.int64), *self._confirmed])
+        return Assignments(self._track_id, self._split, np.unique(confirmed))
+
+    def _slices(self) -> Iterator[tuple[int, int]]:
+        time = self._m.time
+        used = np.unique(self._m.source)
+        width = min(_LONGEST_SLICE, _SLICE * float(self._periods[used].min())) if len(used) else 1.0
+        begin = 0
+        while begin < len(time):
+            end = int(np.searchsorted(time, time[begin] + width, side="right"))
+            yield begin, end
+            begin = end
+
+    def _housekeep(self, now: float) -> None:
+        """Publish what coasts and drop what is overdue."""
+        rows, expected = self._life.to_coast(now)
+        while len(rows):
+            self._publish_coasted(rows, expected)
+            rows, expected = self._life.to_coast(now)
+        overdue = self._life.overdue(now)
+        self._kinematics.remove(overdue)
+        self._life.end(overdue)
+
+    def _scan(self, index: _Index, period: float) -> None:
+        """Associate and absorb the plots of one source in one slice."""
+        life = self._life
+        gated = self._gate(self._kinematics, life, self._m, index)
+        log_f = gated.copies.update(gated.copy, gated.plan)
+        chosen = assign(gated.pairs, self._gain(gated, index, log_f))
+        rows, plots = gated.pairs.track[chosen], index[gated.pairs.plot[chosen]]
+        seed = life.status[rows] == SEED
+        self._start(rows[seed], plots[seed])
+        self._kinematics.put(rows[~seed], gated.copies, gated.copy[chosen[~seed]])
+        self._enter(rows, plots, period, gated.height_used[chosen])
+        d2 = np.where(seed, np.nan, gated.d2[chosen])  # a start has no innovation of a filter
+        self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2)
+        left = np.setdiff1d(np.arange(len(index)), gated.pairs.plot[chosen])
+        self._begin(index[left], plots[life.status[rows] == CONFIRMED], period)
+
+    def _gain(self, gated: Gated, index: _Index, log_f: _Array) -> _Array:
+        """Log-likelihood ratio of "this plot is this track's" against "the track missed and the plot is new"."""
+        settings, m, life = self._settings, self._m, self._life
+        track, plot = gated.pairs.track, index[gated.pairs.plot]
+        detection = settings.detection_probability
+        gain = log_f - np.log(settings.clutter_density) + np.log(detection / (1.0 - detection))
+        has_height = np.isfinite(m.position[plot, 2])
+        gain = gain + np.where(gated.height_used, np.log((1.0 - settings.altitude_outlier) * _HEIGHT_SPAN), 0.0)
+        gain = gain + np.where(has_height & ~gated.height_used, np.log(settings.altitude_outlier), 0.0)
+        gain = gain + np.where(gated.fault > 0, np.log(settings.plot_outlier), 0.0)
+        gain = gain + _STANDING[life.status[track]]
+        if self._use_identity:
+            gain = gain + identity_gain(life.icao24[track], m.icao24[plot], life.mode3a[track], m.mode3a[plot])
+        return np.asarray(gain)
+
+    def _start(self, rows: _Index, plots: _Index) -> None:
+        """Begin the filters of tracks that found their second plot."""
+        m, life, prior = self._m, self._life, self._settings.height_prior
+        first, dt = life.plot[rows], m.time[plots] - life.time[rows]
+        start = two_point_start(*m.with_height(first, prior), *m.with_height(plots, prior), dt)
+        # The target may have manoeuvred between the two.
+        start.cov[:, [1, 3], [1, 3]] += self._mean_accel_sq * (0.5 * dt[:, None]) ** 2
+        known = np.isfinite(m.position[plots, 2])
+        one_height = ~(known & np.isfinite(m.position[first, 2]))
+        position, cov = m.with_height(np.where(known, plots, first)[one_height], prior)
+        start.mean[one_height, 4], start.mean[one_height, 5] = position[:, 2], 0.0
+        start.cov[one_height, 4:, :] = start.cov[one_height, :, 4:] = 0.0
+        start.cov[one_height, 4, 4], start.cov[one_height, 5, 5] = cov[:, 2, 2], _CLIMB**2
+        self._kinematics.write(rows, start)
+
+    def _enter(self, rows: _Index, plots: _Index, period: float, height_used: npt.NDArray[np.bool_]) -> None:
+        """Note plots, codes and status of the rows updated."""
+        life = self._life
+        fresh = life.status[rows] != CONFIRMED
+        life.hit(rows, self._m.time[plots], np.full(len(rows), period), plots)
+        life.has_altitude[rows] |= height_used
+        self._note_codes(rows, plots)
+        self._track_id[plots] = life.id[rows]
+        self._confirmed.append(life.id[rows[fresh & (life.status[rows] == CONFIRMED)]])
+
+    def _begin(self, plots: _Index, used: _Index, period: float) -> None:
+        """Mark split plots among those left over, and begin a track with every other one."""
+        m, life, settings = self._m, self._life, self._settings
+        split = m.split_from(plots, used, settings.split_range, np.radians(settings.split_azimuth))
+        self._split[plots[split]] = True
+        plots = plots[~split]
+        mean, cov = np.zeros((len(plots), 6)), np.zeros((len(plots), 6, 6))
+        mean[:, 0::2], cov[:, 0::2, 0::2] = m.with_height(plots, settings.height_prior)
+        cov[:, [1, 3], [1, 3]] = self._seed_speed**2
+        cov[:, 5, 5] = _CLIMB**2
+        rows = self._kinematics.add(Start(mean, cov))
+        life.begin(rows, Birth(m.time[plots], np.full(len(plots), period), plots))
+        life.has_altitude[rows] = np.isfinite(m.position[plots, 2])
+        self._note_codes(rows, plots)
+        self._track_id[plots] = life.id[rows]
+
+    def _note_codes(self, rows: _Index, plots: _Index) -> None:
+        if self._use_identity:
+            m, life = self._m, self._life
+            life.icao24[rows] = np.where(m.icao24[plots] >= 0, m.icao24[plots], life.icao24[rows])
+            life.mode3a[rows] = np.where(m.mode3a[plots] >= 0, m.mode3a[plots], life.mode3a[rows])
+            life.named[rows] = np.where(m.named[plots], plots, life.named[rows])
+
+    def _publish(self, rows: _Index, plots: _Index, centre: _Array, gate_cov: _Array, d2: _Array) -> None:
+        if len(rows):
+            life, moments = self._life, self._kinematics.moments(rows)
+            codes = life.icao24[rows], life.mode3a[rows], life.named[rows]
+            self._emit(
+                Rows(
+                    life.id[rows],
+                    self._m.time[plots],
+                    moments,
+                    life.status[rows],
+                    life.has_altitude[rows],
+                    *codes,
+                    plots,
+                    centre,
+                    gate_cov,
+                    d2,
+                )
+            )
+
+    def _publish_coasted(self, rows: _Index, time: _Array) -> None:
+        life, nothing = self._life, np.full(len(rows), -1)
+        ahead = self._kinematics.predicted(rows, time - life.time[rows])
+        moments = ahead.moments(np.arange(len(rows)))
+        self._emit(
+            Rows(
+                life.id[rows],
+                time,
+                moments,
+                np.full(len(rows), COASTED, np.int8),
+                life.has_altitude[rows],
+                life.icao24[rows],
+                life.mode3a[rows],
+                life.named[rows],
+                nothing,
+                moments.mean[:, [0, 2]],
+                moments.cov[:, [[0], [2]], [0, 2]],
+                np.full(len(rows), np.nan),
+            )
+        )
