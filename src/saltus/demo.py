@@ -1,0 +1,252 @@
+"""The demonstration: simulate two radars, write ASTERIX, track the files, compare with the truth."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from saltus.io.asterix_write import write_cat048
+from saltus.io.write import output_directory
+from saltus.metrics import FalseTracks, TrackScores, false_tracks, track_scores
+from saltus.simulate import Observations, observe
+from saltus.simulate.scene import DURATION, Aircraft, RadarStation, demo_aircraft, demo_plane, demo_radars
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+__all__ = ["Score", "Simulated", "run_demo", "score_demo", "write_demo"]
+
+_DATE = "2025-06-01"
+_MIDNIGHT = np.datetime64(_DATE).astype("datetime64[s]").astype(np.int64).item()
+_START = 10 * 3600.0  # s after midnight: the scene's time 0
+_FILES = ("radar_a.ast", "radar_b.ast")
+
+
+class Simulated(NamedTuple):
+    """What was written, and which aircraft each plot came from."""
+
+    files: tuple[Path, ...]
+    config: Path
+    labels: tuple[npt.NDArray[np.int64], ...]  # per file, per record of CAT048: index of the aircraft, -1 = clutter
+
+
+class Score(NamedTuple):
+    """The tracks against the truth; arrays have one entry per aircraft."""
+
+    tracks: TrackScores
+    false: FalseTracks
+    n_plots: npt.NDArray[np.int64]
+    rmse: npt.NDArray[np.float64]  # m, horizontal, of confirmed rows; NaN without any
+    p_turning: float  # mean probability of a horizontal manoeuvre while the aircraft turns or changes speed
+    p_straight: float  # and 30 s or more after it has ceased
+
+
+def run_demo(output: Path, seed: int) -> None:
+    """Simulate a scene into OUTPUT, track it as any recording, print how well that went.
+
+    Args:
+        output: directory for radar_a.ast, radar_b.ast, sensors.toml, truth.parquet and the tracker's results.
+        seed: of the noise, the misses and the clutter.
+
+    Raises:
+        DataError: the output cannot be written.
+    """
+    from rich.console import Console
+
+    from saltus.run import track_files
+
+    console = Console()
+    console.print(f"Two radars, {len(demo_aircraft())} aircraft, {DURATION / 60:.0f} minutes, seed {seed}.")
+    simulated = write_demo(output, seed)
+    track_files(simulated.files, output, simulated.config, None, "use", None, None, report=True)
+    tracks = pq.read_table(output / "tracks.parquet")
+    score = score_demo(tracks, pq.read_table(output / "assignments.parquet"), simulated.labels)
+    console.print(_table(score))
+    for line in _summary(score):
+        console.print(line)
+    console.print(f"Written to {output}: " + ", ".join(sorted(p.name for p in output.iterdir() if p.is_file())))
+
+
+def write_demo(output: Path, seed: int) -> Simulated:
+    """Simulate the radars and write their recordings, the configuration and the truth.
+
+    Raises:
+        DataError: the output cannot be written.
+    """
+    aircraft, plane, stations = demo_aircraft(), demo_plane(), demo_radars()
+    trajectories = [a.trajectory for a in aircraft]
+    labels = []
+    with output_directory(output) as folder:
+        streams = np.random.default_rng(seed).spawn(len(stations))
+        for name, station, rng in zip(_FILES, stations, streams, strict=True):
+            seen = observe(station.radar, trajectories, plane, 0.0, DURATION, rng)
+            _write_recording(folder / name, station, seen, aircraft)
+            labels.append(seen.target)
+        (folder / "sensors.toml").write_text(_configuration(stations), encoding="utf-8")
+        pq.write_table(_truth(aircraft), folder / "truth.parquet")
+    return Simulated(tuple(output / name for name in _FILES), output / "sensors.toml", tuple(labels))
+
+
+def _write_recording(path: Path, station: RadarStation, seen: Observations, aircraft: Sequence[Aircraft]) -> None:
+    """Write one radar's plots with the codes of their aircraft; clutter (target -1) takes the last entry, none."""
+    write_cat048(
+        path,
+        sac=station.sac,
+        sic=station.sic,
+        time_of_day=_START + seen.time,
+        range_m=seen.slant,
+        azimuth_rad=seen.azimuth,
+        altitude_m=seen.altitude,
+        icao24=np.array([*(a.icao24 for a in aircraft), -1])[seen.target],
+        mode3a=np.array([*(a.mode3a for a in aircraft), -1])[seen.target],
+        callsign=np.array([*(a.name if a.icao24 >= 0 else "" for a in aircraft), ""])[seen.target],
+        north_marker_times=_START + station.radar.north_times(0.0, DURATION),
+    )
+
+
+def _configuration(stations: Sequence[RadarStation]) -> str:
+    lines = ["# The demonstration's radars. Their noise is left for the tracker to estimate.", f"date = {_DATE}"]
+    for station in stations:
+        site = station.radar.site
+        lines += [
+            "",
+            "[[sensor]]",
+            f'name = "{station.name}"',
+            f"sac = {station.sac}",
+            f"sic = {station.sic}",
+            f"latitude = {np.degrees(site.latitude):.8f}",
+            f"longitude = {np.degrees(site.longitude):.8f}",
+            f"height = {site.height:.1f}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _truth(aircraft: Sequence[Aircraft]) -> pa.Table:
+    """Every aircraft's state each second: degrees, metres, m/s true east, north and up, as in tracks.parquet."""
+    plane, seconds = demo_plane(), np.arange(DURATION + 1)
+    tables = []
+    for craft in aircraft:
+        motion = craft.trajectory.at(seconds)
+        state = np.stack([motion.position, motion.velocity], axis=-1)[:, :2].reshape(-1, 4)
+        true = plane.to_true(state, np.zeros((len(state), 4, 4)), motion.position[:, 2])
+        columns = {
+            "aircraft": pa.array([craft.name] * len(state)),
+            "time": _MIDNIGHT + _START + seconds,
+            "latitude": np.degrees(true.latitude),
+            "longitude": np.degrees(true.longitude),
+            "altitude": motion.position[:, 2],
+            "ve": true.velocity[:, 0],
+            "vn": true.velocity[:, 1],
+            "vu": motion.velocity[:, 2],
+            "turning": motion.turning,
+            "mode3a": pa.array([f"{craft.mode3a:04o}"] * len(state)),
+            "icao24": pa.array([f"{craft.icao24:06x}" if craft.icao24 >= 0 else None] * len(state), pa.string()),
+        }
+        tables.append(pa.table(columns).filter(pa.array(np.isfinite(motion.position[:, 0]))))
+    return pa.concat_tables(tables)
+
+
+def score_demo(tracks: pa.Table, assignments: pa.Table, labels: Sequence[npt.NDArray[np.int64]]) -> Score:
+    """Compare tracks with the truth through the plots they were made of.
+
+    Args:
+        tracks: columns of tracks.parquet.
+        assignments: columns of assignments.parquet.
+        labels: of `Simulated`.
+    """
+    label, track = _labelled(assignments, labels)
+    columns = ("track_id", "time", "status", "p_manoeuvre_h", "latitude", "longitude")
+    ids, time, status, p, lat, lon = (tracks.column(name).to_numpy() for name in columns)
+    sure = status == "confirmed"
+    confirmed = np.unique(ids[sure])
+    xy, t = demo_plane().forward(np.radians(lat), np.radians(lon)), time - _MIDNIGHT - _START
+    owner = _owners(ids, track, label)
+    aircraft = demo_aircraft()
+    rmse, turning, straight = np.full(len(aircraft), np.nan), [np.empty(0)], [np.empty(0)]
+    for k, craft in enumerate(aircraft):
+        mine = sure & (owner == k)
+        motion = craft.trajectory.at(t[mine])
+        error_sq = np.sum((xy[mine] - motion.position[:, :2]) ** 2, axis=-1)
+        rmse[k] = np.sqrt(error_sq.mean()) if len(error_sq) else np.nan
+        turning.append(p[mine][motion.turning])
+        straight.append(p[mine][_steady(craft, t[mine])])
+    return Score(
+        tracks=track_scores(track, label, confirmed=confirmed),
+        false=false_tracks(track, label, duration=DURATION, confirmed=confirmed),
+        n_plots=np.bincount(label[label >= 0], minlength=len(aircraft)),
+        rmse=rmse,
+        p_turning=_mean(np.concatenate(turning)),
+        p_straight=_mean(np.concatenate(straight)),
+    )
+
+
+def _labelled(
+    assignments: pa.Table, labels: Sequence[npt.NDArray[np.int64]]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Aircraft and track of every report; -1 for clutter and for reports no track used."""
+    files = {Path(name).name: k for k, name in enumerate(_FILES)}
+    source = np.array([files[Path(name).name] for name in assignments.column("source").to_pylist()], np.int64)
+    record = assignments.column("record").to_numpy()
+    label = np.full(len(record), -1, np.int64)
+    for k, known in enumerate(labels):
+        label[source == k] = known[record[source == k]]
+    return label, assignments.column("track_id").fill_null(-1).to_numpy().astype(np.int64)
+
+
+def _owners(
+    ids: npt.NDArray[np.int64], track: npt.NDArray[np.int64], label: npt.NDArray[np.int64]
+) -> npt.NDArray[np.int64]:
+    """Aircraft that gave most plots of each row's track; -1 if it was clutter."""
+    names, row = np.unique(ids, return_inverse=True)
+    owners = [np.bincount(label[track == name] + 1, minlength=1).argmax() - 1 for name in names]
+    return np.array(owners, np.int64)[row] if len(names) else np.empty(0, np.int64)
+
+
+def _steady(craft: Aircraft, t: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """Times at which an aircraft has flown straight for 30 s (it turns for longer than the step of 2 s)."""
+    lags = np.arange(0.0, 31.0, 2.0)
+    turned = craft.trajectory.at((t[:, None] - lags).reshape(-1)).turning.reshape(len(t), len(lags))
+    return np.asarray(~turned.any(axis=1))
+
+
+def _mean(values: npt.NDArray[np.float64]) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _table(score: Score) -> "Table":
+    from rich.table import Table
+
+    table = Table(title="Aircraft and their confirmed tracks", title_justify="left")
+    table.add_column("aircraft")
+    table.add_column("what it does")
+    table.add_column("identity")
+    for name in ("plots", "tracks", "on tracks", "RMSE, m"):
+        table.add_column(name, justify="right")
+    at = {int(k): i for i, k in enumerate(score.tracks.objects)}
+    for k, craft in enumerate(demo_aircraft()):
+        if k in at:
+            n_tracks, share = score.tracks.per_object_tracks[at[k]], score.tracks.per_object_completeness[at[k]]
+            cells = [str(score.n_plots[k]), str(n_tracks), f"{100 * share:.1f} %", f"{score.rmse[k]:.0f}"]
+        else:
+            cells = [str(score.n_plots[k]), "-", "-", "-"]
+        table.add_row(craft.name, craft.doing, "Mode S" if craft.icao24 >= 0 else "Mode A/C", *cells)
+    return table
+
+
+def _summary(score: Score) -> list[str]:
+    s, f = score.tracks, score.false
+    rmse = score.rmse[np.isfinite(score.rmse)]
+    spread = (
+        f"{rmse.min():.0f} to {rmse.max():.0f} m, median {np.median(rmse):.0f} m" if len(rmse) else "no confirmed track"
+    )
+    return [
+        f"Plots of aircraft on confirmed tracks: {100 * s.completeness:.2f} %. "
+        f"Plots on a track of their own aircraft: {100 * s.purity:.2f} %. Tracks per aircraft: {s.fragmentation:.2f}.",
+        f"False confirmed tracks: {f.n_false}, that is {f.per_hour:.0f} per hour (95 %: {f.low:.0f} to {f.high:.0f}).",
+        f"Horizontal RMSE: {spread}.",
+        f"Probability of horizontal manoeuvre: {score.p_turning:.2f} turning, {score.p_straight:.2f} in steady flight.",
+    ]
