@@ -1,0 +1,239 @@
+"""The configuration: what recordings do not tell, and what a user may set, as TOML.
+
+date = 2023-05-02                 # of the first record: ASTERIX carries only the time of day
+
+[[sensor]]
+sac = 20
+sic = 129
+latitude = 41.30069956            # degrees, WGS-84
+longitude = 2.10205819
+height = 27.3                     # m above mean sea level; absent = unknown
+category = 48                     # optional: sources of this category only
+name = "BCN"                      # optional; alone, without sac and sic, it names the source of a table
+sigma_range = 30.0                # optional noise: m,
+sigma_azimuth = 0.08              # degrees,
+sigma_xy = 10.0                   # m (plane and geodetic positions),
+sigma_altitude = 8.0              # m
+
+[editions]
+21 = "0.23"                       # category = edition; others are guessed
+
+[tracker]                         # fields of saltus.tracks.settings.TrackerSettings
+[filter]                          # fields of saltus.tracks.settings.FilterSettings
+"""
+
+import dataclasses
+import datetime
+import difflib
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, TypeVar, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+
+from saltus.errors import ModelError
+from saltus.records import System
+from saltus.tracks.settings import FilterSettings, TrackerSettings
+
+__all__ = ["Config", "SensorConfig", "load_config", "parse_date"]
+
+_HINTS = {
+    "sac": "a whole number from 0 to 255",
+    "sic": "a whole number from 0 to 255",
+    "category": "an ASTERIX category, 1 to 255",
+    "latitude": "degrees north, -90 to 90",
+    "longitude": "degrees east, -180 to 180",
+    "height": "m above mean sea level, -450 to 9000 (1 ft = 0.3048 m); leave it out when unknown",
+    "sigma_range": "one standard deviation in m, above 0 and up to 10000",
+    "sigma_azimuth": "one standard deviation in degrees, above 0 and up to 10",
+    "sigma_xy": "one standard deviation in m, above 0 and up to 10000",
+    "sigma_altitude": "one standard deviation in m, above 0 and up to 10000",
+    "name": 'text, as name = "BCN"',
+    "date": "a date, as date = 2023-05-02",
+    "editions": 'category = "edition" in quotes, as 21 = "0.23"',
+}
+
+T = TypeVar("T", TrackerSettings, FilterSettings)
+_Octet = Annotated[int, Field(ge=0, le=255)]
+_Sigma = Annotated[float, Field(gt=0.0, le=1e4)]
+
+
+class SensorConfig(BaseModel):
+    """A sensor's site and noise; angles in degrees, lengths in m."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    latitude: Annotated[float, Field(ge=-90.0, le=90.0)]
+    longitude: Annotated[float, Field(ge=-180.0, le=180.0)]
+    sac: _Octet | None = None
+    sic: _Octet | None = None
+    height: Annotated[float, Field(ge=-450.0, le=9000.0)] | None = None
+    category: Annotated[int, Field(ge=1, le=255)] | None = None
+    name: str = ""
+    sigma_range: _Sigma | None = None
+    sigma_azimuth: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
+    sigma_xy: _Sigma | None = None
+    sigma_altitude: _Sigma | None = None
+
+    @model_validator(mode="after")
+    def _identified(self) -> "SensorConfig":
+        if (self.sac is None) != (self.sic is None):
+            raise ValueError("sac and sic go together: give both")
+        if self.sac is None and not self.name:
+            raise ValueError("give sac and sic, or for tables the name of the source")
+        return self
+
+    def matches(self, system: System) -> bool:
+        """Whether this is the sensor of a system: by SAC and SIC (and category, if given), tables by name."""
+        if system.category is None:
+            return self.name == system.name
+        return (self.sac, self.sic) == (system.sac, system.sic) and self.category in (None, system.category)
+
+
+class Config(BaseModel):
+    """Everything a configuration file says, checked."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    date: datetime.date | None = None
+    sensor: tuple[SensorConfig, ...] = ()
+    editions: dict[int, str] = Field(default_factory=dict)
+    tracker: TrackerSettings = Field(default_factory=TrackerSettings)
+    filter: FilterSettings = Field(default_factory=FilterSettings)
+
+    def site_for(self, system: System) -> SensorConfig | None:
+        """The sensor of a system; one that names the category goes before one that does not."""
+        found = [s for s in self.sensor if s.matches(system)]
+        return min(found, key=lambda s: s.category is None, default=None)
+
+
+def load_config(path: Path | str | None) -> Config:
+    """Read and check a configuration file; without one, the defaults.
+
+    Raises:
+        ModelError: the file is no TOML, a key is unknown, or a value cannot be; the message names file, key and value.
+    """
+    if path is None:
+        return Config()
+    try:
+        with Path(path).open("rb") as file:
+            content = tomllib.load(file)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ModelError(f"{path}: no readable TOML: {error}.") from error
+    _known(path, "", content, Config.model_fields)
+    values: dict[str, object] = {
+        "tracker": _settings(path, "tracker", content.get("tracker", {}), TrackerSettings),
+        "filter": _settings(path, "filter", content.get("filter", {}), FilterSettings),
+        "sensor": _sensors(path, content.get("sensor", [])),
+        "editions": _editions(path, content.get("editions", {})),
+    }
+    if "date" in content:
+        values["date"] = _date(path, content["date"])
+    return Config.model_validate(values)
+
+
+def parse_date(text: str) -> datetime.date:
+    """Read a date given on the command line.
+
+    Raises:
+        ModelError: it is no date of the form YYYY-MM-DD.
+    """
+    try:
+        return datetime.date.fromisoformat(text)
+    except ValueError as error:
+        raise ModelError(f"date {text!r}: {error}. Write YYYY-MM-DD, as 2023-05-02.") from error
+
+
+def _date(path: Path | str, value: object) -> datetime.date:
+    if isinstance(value, datetime.date) and not isinstance(value, datetime.datetime):
+        return value
+    if isinstance(value, str):
+        return parse_date(value)
+    raise ModelError(f"{path}: date = {value}: write {_HINTS['date']}.")
+
+
+def _sensors(path: Path | str, tables: object) -> tuple[SensorConfig, ...]:
+    if not isinstance(tables, list):
+        raise ModelError(f"{path}: [sensor] is one table; write [[sensor]] with two brackets for each sensor.")
+    sensors = []
+    for k, table in enumerate(tables):
+        where = f"[[sensor]] number {k + 1}"
+        _known(path, where, table, SensorConfig.model_fields)
+        try:
+            sensors.append(SensorConfig.model_validate(table))
+        except ValidationError as error:
+            raise ModelError(f"{path}: {where}: {_first(error)}") from error
+    seen: dict[tuple[object, ...], int] = {}
+    for k, s in enumerate(sensors):
+        key = (s.category, s.sac, s.sic) if s.sac is not None else (s.name,)
+        if key in seen:
+            raise ModelError(
+                f"{path}: [[sensor]] number {seen[key] + 1} and number {k + 1} are the same system "
+                f"(category, sac, sic = {key}); keep one, or tell them apart by category."
+            )
+        seen[key] = k
+    return tuple(sensors)
+
+
+def _first(error: ValidationError) -> str:
+    """One clear line of pydantic's first finding."""
+    finding = error.errors(include_url=False)[0]
+    key = str(finding["loc"][0]) if finding["loc"] else ""
+    if finding["type"] == "missing":
+        return f"{key} is missing: {_HINTS.get(key, '')}."
+    said = finding["msg"].removeprefix("Value error, ")
+    if not key:
+        return f"{said}."
+    return f"{key} = {finding['input']!r}: {said[0].lower()}{said[1:]}. Give {_HINTS.get(key, 'another value')}."
+
+
+def _editions(path: Path | str, table: object) -> dict[int, str]:
+    if not isinstance(table, Mapping):
+        raise ModelError(f"{path}: editions = {table!r}: make it a table [editions] of {_HINTS['editions']}.")
+    editions = {}
+    for key, value in table.items():
+        if not str(key).isdigit() or not 1 <= int(key) <= 255 or not isinstance(value, str):
+            raise ModelError(f"{path}: [editions] {key} = {value!r}: write {_HINTS['editions']}.")
+        editions[int(key)] = value
+    return editions
+
+
+def _settings(path: Path | str, name: str, table: object, kind: type[T]) -> T:
+    """Make settings from a table, each value checked against the type of its field."""
+    if not isinstance(table, Mapping):
+        raise ModelError(f"{path}: {name} = {table!r}: make it a table [{name}].")
+    fields = [f.name for f in dataclasses.fields(kind)]
+    _known(path, f"[{name}]", table, fields)
+    types = get_type_hints(kind)
+    values = {}
+    for key, value in table.items():
+        try:
+            values[key] = TypeAdapter(types[key]).validate_python(_tuples(value), strict=True)
+        except ValidationError as error:
+            said = error.errors(include_url=False)[0]["msg"]
+            raise ModelError(f"{path}: [{name}] {key} = {value!r}: {said[0].lower()}{said[1:]}.") from error
+    try:
+        return kind(**values)
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+def _tuples(value: object) -> object:
+    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+
+
+def _known(path: Path | str, where: str, table: object, known: Iterable[str]) -> None:
+    """Refuse keys that mean nothing here: a misspelt one would be obeyed in silence."""
+    if not isinstance(table, Mapping):
+        raise ModelError(f"{path}: {where}: a table of keys is expected, not {table!r}.")
+    names = list(known)
+    for key in table:
+        if key not in names:
+            near = difflib.get_close_matches(key, names, n=2) or names
+            place = f"{where}: " if where else ""
+            raise ModelError(
+                f"{path}: {place}unknown key {key!r}. Did you mean {' or '.join(near)}?"
+                if near is not names
+                else f"{path}: {place}unknown key {key!r}. Known are: {', '.join(names)}."
+            )
