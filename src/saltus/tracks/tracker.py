@@ -14,7 +14,7 @@ from saltus.tracks.lifecycle import COASTED, CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
-__all__ = ["Assignments", "Rows", "Tracker"]
+__all__ = ["Assignments", "Rows", "Tracker", "join_rows"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -41,6 +41,28 @@ class Rows(NamedTuple):
     centre: _Array  # (k, 2): centre of the gate
     gate_cov: _Array  # (k, 2, 2): innovation covariance
     d2: _Array  # squared Mahalanobis distance of the horizontal innovation; NaN where there is none
+
+
+def join_rows(parts: Sequence[Rows]) -> Rows:
+    """Join rows published at different times; no part gives no rows."""
+    nothing = Rows(
+        np.zeros(0, np.int64),
+        np.zeros(0),
+        Moments(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros(0), np.zeros(0)),
+        np.zeros(0, np.int8),
+        np.zeros(0, bool),
+        np.zeros(0, np.int32),
+        np.zeros(0, np.int16),
+        np.zeros(0, np.intp),
+        np.zeros(0, np.intp),
+        np.zeros((0, 2)),
+        np.zeros((0, 2, 2)),
+        np.zeros(0),
+    )
+    parts = [nothing, *parts]
+    moments = Moments(*(np.concatenate(column) for column in zip(*(p.moments for p in parts), strict=True)))
+    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Rows._fields if name != "moments"}
+    return Rows(moments=moments, **columns)
 
 
 class Assignments(NamedTuple):

@@ -1,0 +1,369 @@
+"""`saltus track`: recordings in, tracks, assignments, summary and report out."""
+
+import json
+import re
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from saltus import io
+from saltus.config import Config, SensorConfig, load_config, parse_date
+from saltus.errors import DataError
+from saltus.geo import Plane, Site
+from saltus.io.write import output_directory
+from saltus.progress import Progress, progress_bar
+from saltus.records import REASONS, Kind, Plots, Recording, Source
+from saltus.tracks.measurements import Measurements, Noise, default_noise, make_plane, place_plots
+from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise
+from saltus.tracks.output import assignment_table, innovation_table, track_table
+from saltus.tracks.tracker import Assignments, Rows, Tracker, join_rows
+
+__all__ = ["track_files"]
+
+_Array = npt.NDArray[np.float64]
+
+_UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
+_NOISE_PLOTS = 10_000  # reports of each source that the noise is estimated from before tracking
+_NO_PERIOD = 4.0  # s: update period where the recording does not tell
+_SIGMAS = {  # by whether the source is polar: label, field of Noise, unit
+    True: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
+    False: (("sigma_xy_m", "xy", 1.0),),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Sensors:
+    """What is known of each source of a recording, by source index."""
+
+    sites: list[Site | None]
+    configured: list[dict[str, float]]  # fields of Noise that the configuration gives
+    periods: list[float]
+    names: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Tracked:
+    """Everything the tracker found."""
+
+    rows: list[Rows]
+    measurements: Measurements
+    assignments: Assignments
+    plane: Plane
+    noise: dict[int, Noise]
+    estimates: dict[int, NoiseEstimate]
+
+
+def track_files(
+    inputs: Sequence[Path],
+    output: Path,
+    config_path: Path | None = None,
+    date_text: str | None = None,
+    identity: str = "use",
+    time_from: str | None = None,
+    time_to: str | None = None,
+    *,
+    report: bool = True,
+) -> dict[str, object]:
+    """Track recordings and write `tracks.parquet`, `assignments.parquet`, `summary.json` and `report.html`.
+
+    Args:
+        inputs: recordings; several are merged by time.
+        output: directory to write into; its files appear together at the end, or not at all.
+        config_path: TOML configuration.
+        date_text: YYYY-MM-DD of the recording; wins over the configuration's.
+        identity: "use" or "ignore" the codes that plots carry.
+        time_from: first time used, HH:MM[:SS] of the recording's day or ISO 8601, UTC.
+        time_to: last time used.
+        report: whether to write the report.
+
+    Returns:
+        The summary, as written.
+
+    Raises:
+        DataError: an input cannot be read, or nothing in it can be tracked.
+        ModelError: the configuration is wrong.
+    """
+    began = time.perf_counter()
+    config = load_config(config_path)
+    day = parse_date(date_text) if date_text else config.date
+    with progress_bar() as bar, output_directory(output) as folder:
+        recording = io.read(inputs, date=day, editions=config.editions, progress=bar.reading)
+        decoded = time.perf_counter()
+        plots, sensors, problems = _prepare(recording, config, time_from, time_to)
+        tracked = _track(plots, sensors, config, identity == "use", bar)
+        tracks, gates = _tables(tracked, plots, config)
+        assigned = assignment_table(plots, tracked.measurements, tracked.assignments)
+        done = time.perf_counter()
+        summary = _summary(inputs, plots, sensors, tracked, tracks, assigned, problems)
+        summary["settings"] = {
+            "identity": identity,
+            "tracker": asdict(config.tracker),
+            "filter": asdict(config.filter),
+        }
+        summary["seconds"] = {"decoding": round(decoded - began, 2), "tracking": round(done - decoded, 2)}
+        _write(folder, tracks, assigned, summary)
+        if report:
+            from saltus.report import write_report
+
+            sites = {str(s.system): site for s, site in zip(plots.sources, sensors.sites, strict=True) if site}
+            write_report(
+                folder / "report.html",
+                tracks=tracks,
+                plots=plots,
+                assignments=assigned,
+                innovations=gates,
+                summary=summary,
+                sites=sites,
+            )
+    _show(summary, output, report)
+    return summary
+
+
+def parse_time(text: str, start: float) -> float:
+    """Read HH:MM[:SS] of the day of `start` (UTC seconds), or ISO 8601 (UTC unless it says otherwise)."""
+    if re.fullmatch(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?", text):
+        hours, minutes, *seconds = (float(part) for part in text.split(":"))
+        if hours < 24 and minutes < 60 and sum(seconds) < 60:
+            return float(np.floor(start / 86400.0) * 86400.0 + 3600.0 * hours + 60.0 * minutes + sum(seconds))
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise DataError(f"{text!r} is no time; write HH:MM, HH:MM:SS or 2023-05-02T08:00:00 (UTC).") from error
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _prepare(
+    recording: Recording, config: Config, time_from: str | None, time_to: str | None
+) -> tuple[Plots, _Sensors, list[str]]:
+    """Mark what cannot be used, and gather what is known of the sensors."""
+    plots, problems = recording.plots, list(recording.problems)
+    reason = plots.reason.copy()
+    usable = (reason == 0) & np.isfinite(plots.time)
+    if usable.any():
+        start = float(plots.time[usable].min())
+        outside = np.zeros(len(plots), bool)
+        if time_from is not None:
+            outside |= plots.time < parse_time(time_from, start)
+        if time_to is not None:
+            outside |= plots.time > parse_time(time_to, start)
+        reason[usable & outside] = REASONS.index("outside time window")
+    sensors = _sensors(plots.sources, recording, config)
+    for s, source in enumerate(plots.sources):
+        needs = (plots.source == s) & ((plots.kind == Kind.POLAR) | (plots.kind == Kind.PLANE)) & (reason == 0)
+        if sensors.sites[s] is None and needs.any():
+            reason[needs] = REASONS.index("site unknown")
+            problems.append(_site_wanted(source, int(needs.sum())))
+    plots = replace(plots, reason=reason)
+    if not (reason == 0).any():
+        raise DataError(_nothing_left(plots, problems))
+    return plots, sensors, problems
+
+
+def _site_wanted(source: Source, count: int) -> str:
+    system = source.system
+    keys = f"sac = {system.sac}, sic = {system.sic}" if system.category is not None else f'name = "{system.name}"'
+    return (
+        f"{system}: {count} reports are relative to a site whose position is not configured. Give it in a file "
+        f"named with --config: a [[sensor]] table with {keys}, latitude, longitude (degrees), height (m)."
+    )
+
+
+def _nothing_left(plots: Plots, problems: Sequence[str]) -> str:
+    if not len(plots):
+        return "the inputs hold no target report. " + " ".join(problems)
+    counts = np.bincount(plots.reason, minlength=len(REASONS))
+    listed = ", ".join(f"{counts[k]} {REASONS[k]}" for k in np.argsort(-counts) if k and counts[k])
+    return f"no report can be tracked: {listed}. " + " ".join(problems)
+
+
+def _sensors(sources: Sequence[Source], recording: Recording, config: Config) -> _Sensors:
+    sites: list[Site | None] = []
+    configured: list[dict[str, float]] = []
+    periods, names = [], []
+    for source in sources:
+        sensor = config.site_for(source.system)
+        sites.append(None if sensor is None else _site(sensor))
+        configured.append({} if sensor is None else _noise(sensor))
+        found = [c.update_period for c in recording.contents if c.system == source.system]
+        told = [p for p in found if np.isfinite(p) and p > 0]
+        periods.append(float(np.median(told)) if told else _NO_PERIOD)
+        names.append(sensor.name if sensor is not None and sensor.name else str(source.system))
+    return _Sensors(sites, configured, periods, names)
+
+
+def _site(sensor: SensorConfig) -> Site:
+    latitude, longitude = np.radians([sensor.latitude, sensor.longitude])
+    height, sigma = _UNKNOWN_HEIGHT if sensor.height is None else (sensor.height, 0.0)
+    return Site(float(latitude), float(longitude), height, sigma)
+
+
+def _noise(sensor: SensorConfig) -> dict[str, float]:
+    azimuth = None if sensor.sigma_azimuth is None else float(np.radians(sensor.sigma_azimuth))
+    given = {
+        "range": sensor.sigma_range,
+        "azimuth": azimuth,
+        "xy": sensor.sigma_xy,
+        "altitude": sensor.sigma_altitude,
+    }
+    return {field: value for field, value in given.items() if value is not None}
+
+
+def _track(plots: Plots, sensors: _Sensors, config: Config, use_identity: bool, bar: Progress) -> _Tracked:
+    """Estimate the noise nobody configured on a first stretch, then track everything."""
+    plane = make_plane(plots, sensors.sites)
+    sources = range(len(plots.sources))
+    noise = {s: replace(default_noise(plots.sources[s]), **sensors.configured[s]) for s in sources}
+
+    def run(part: Plots, label: str) -> tuple[list[Rows], Measurements, Assignments, dict[int, NoiseEstimate]]:
+        m = place_plots(part, plane, sensors.sites, noise, config.tracker.height_prior)
+        tracker = Tracker(config.tracker, config.filter, sensors.periods, use_identity=use_identity)
+        rows: list[Rows] = []
+        found = tracker.run(m, rows.append, lambda share: bar.working(label, share))
+        kept = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)
+        return rows, m, found, {s: estimate_noise(m, kept, s) for s in sources}
+
+    if any(not _configured(plots, s, sensors.configured[s]) for s in sources):
+        *_, estimates = run(_first_stretch(plots), "estimating noise")
+        for s in sources:
+            estimated = apply_estimate(noise[s], estimates[s], plots.sources[s])
+            noise[s] = replace(estimated, **sensors.configured[s])
+    rows, m, found, estimates = run(plots, "tracking")
+    return _Tracked(rows, m, found, plane, noise, estimates)
+
+
+def _configured(plots: Plots, s: int, given: dict[str, float]) -> bool:
+    """Say whether the configuration gives every standard deviation that the source's reports need."""
+    polar = bool(((plots.source == s) & (plots.kind == Kind.POLAR)).any())
+    return {"range", "azimuth"} <= set(given) if polar else "xy" in given
+
+
+def _first_stretch(plots: Plots) -> Plots:
+    """Return the reports up to the time by which every source gave enough to estimate its noise from."""
+    last = 0
+    for s in range(len(plots.sources)):
+        own = np.flatnonzero((plots.source == s) & (plots.reason == 0))
+        last = max(last, int(own[min(len(own), _NOISE_PLOTS) - 1]) if len(own) else 0)
+    return plots.take(slice(0, last + 1))
+
+
+def _tables(tracked: _Tracked, plots: Plots, config: Config) -> tuple[pa.Table, pa.Table]:
+    """Return the rows of tracks that were confirmed at some time, in time order, and their gates."""
+    m, plane = tracked.measurements, tracked.plane
+    tracks = [track_table(rows, plane, plots, m, config.tracker.sigma_pressure) for rows in _chunks(tracked.rows)]
+    gates = [innovation_table(rows, plane, plots, m) for rows in _chunks(tracked.rows)]
+    confirmed = pa.array(tracked.assignments.confirmed)
+    tables = []
+    for parts in (tracks, gates):
+        table = pa.concat_tables(parts)
+        table = table.filter(pc.is_in(table["track_id"], value_set=confirmed))
+        tables.append(table.sort_by([("time", "ascending"), ("track_id", "ascending")]))
+    return tables[0], tables[1]
+
+
+def _chunks(rows: Sequence[Rows], size: int = 200) -> Iterator[Rows]:
+    """Join the rows of some slices at a time; one empty chunk where there are none."""
+    for k in range(0, max(1, len(rows)), size):
+        yield join_rows(rows[k : k + size])
+
+
+def _summary(
+    inputs: Sequence[Path],
+    plots: Plots,
+    sensors: _Sensors,
+    tracked: _Tracked,
+    tracks: pa.Table,
+    assigned: pa.Table,
+    problems: Sequence[str],
+) -> dict[str, object]:
+    used = int(pc.sum(pc.is_valid(assigned["track_id"])).as_py() or 0)
+    reasons = pc.value_counts(assigned["reason"].drop_null()).to_pylist()
+    status = np.array(tracks["status"])
+    ids = tracked.assignments.track_id
+    hours = float(np.ptp(tracked.measurements.time)) / 3600.0
+    return {
+        "version": version("saltus"),
+        "inputs": [Path(p).name for p in inputs],
+        "time_from": float(tracked.measurements.time[0]),
+        "time_to": float(tracked.measurements.time[-1]),
+        "reports": {"read": len(plots), "used": used, "unused": len(plots) - used},
+        "reasons": {r["values"]: r["counts"] for r in sorted(reasons, key=lambda r: -r["counts"])},
+        "tracks": {
+            "confirmed": len(tracked.assignments.confirmed),
+            "confirmed_per_hour": round(len(tracked.assignments.confirmed) / hours, 1) if hours > 0 else None,
+            "never_confirmed": len(np.setdiff1d(ids[ids > 0], tracked.assignments.confirmed)),
+            "updates": int((status != "coasted").sum()),
+            "coasted": int((status == "coasted").sum()),
+        },
+        "noise": _noise_table(plots, sensors, tracked),
+        "problems": list(problems),
+    }
+
+
+def _noise_table(plots: Plots, sensors: _Sensors, tracked: _Tracked) -> dict[str, object]:
+    """State for each source what was configured, estimated and used, and whether the innovations agree."""
+    m = tracked.measurements
+    updated = [(rows.measurement, rows.d2) for rows in tracked.rows]
+    measurement = np.concatenate([np.zeros(0, np.intp), *(u[0] for u in updated)])
+    d2 = np.concatenate([np.zeros(0), *(u[1] for u in updated)])
+    table: dict[str, object] = {}
+    for s, name in enumerate(sensors.names):
+        at = (measurement >= 0) & (m.source[measurement] == s) & np.isfinite(d2)
+        given, found, used = sensors.configured[s], tracked.estimates[s], tracked.noise[s]
+        polar = bool(((plots.source == s) & (plots.kind == Kind.POLAR)).any())
+        row: dict[str, object] = {"system": str(plots.sources[s].system)}
+        for label, field, scale in _SIGMAS[polar]:
+            row[label] = {
+                "configured": _rounded(given.get(field, np.nan) * scale),
+                "estimated": _rounded(getattr(found, field) * scale),
+                "used": _rounded(getattr(used, field) * scale),
+            }
+        row["update_period_s"] = _rounded(sensors.periods[s])
+        row["nis_mean"] = _rounded(float(d2[at].mean()) if at.any() else np.nan)
+        row["nis_median"] = _rounded(float(np.median(d2[at])) if at.any() else np.nan)
+        row["nis_expected"] = {"mean": 2.0, "median": 1.386}
+        row["innovations"] = int(at.sum())
+        table[name if name not in table else f"{name} ({plots.sources[s].system})"] = row
+    return table
+
+
+def _rounded(value: float) -> float | None:
+    return float(f"{value:.4g}") if np.isfinite(value) else None
+
+
+def _write(folder: Path, tracks: pa.Table, assigned: pa.Table, summary: dict[str, object]) -> None:
+    pq.write_table(tracks, folder / "tracks.parquet")
+    pq.write_table(assigned, folder / "assignments.parquet")
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+
+
+def _show(summary: dict[str, Any], output: Path, report: bool) -> None:
+    """Say on the screen what was done and where it lies."""
+    reports, tracks = summary["reports"], summary["tracks"]
+    click.echo(f"{reports['read']} reports read, {reports['used']} on {tracks['confirmed']} confirmed tracks")
+    for reason, count in summary["reasons"].items():
+        click.echo(f"  {count:>8} {reason}")
+    for name, row in summary["noise"].items():
+        sigmas = ", ".join(
+            f"{label} {row[label]['used']} (configured {row[label]['configured'] or 'none'}, "
+            f"estimated {row[label]['estimated'] or 'unknown'})"
+            for label in row
+            if label.startswith("sigma")
+        )
+        click.echo(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (expected 2)")
+    for problem in summary["problems"]:
+        click.echo(f"note: {problem}", err=True)
+    seconds = summary["seconds"]
+    click.echo(f"decoding {seconds['decoding']} s, tracking {seconds['tracking']} s; written to {output}/")
+    if report:
+        click.echo(f"open {output / 'report.html'}")
