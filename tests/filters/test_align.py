@@ -87,12 +87,10 @@ def test_message_says_what_is_wrong_where_and_how_to_mend_it(name, value, kind, 
         align(**{**GOOD, name: value})
 
 
-def test_arguments_of_the_filter_are_checked():
+def test_rows_to_keep_are_checked():
     bare = inspect.unwrap(imm_filter)  # without the tests' type checks, as users call it
     with pytest.raises(ModelError, match='keep is "all" or "last"'):
         bare(**GOOD, keep="first")
-    with pytest.raises(ModelError, match="backend is"):
-        bare(**GOOD, backend="fortran")
 
 
 def test_indefinite_matrices_beyond_the_eigenvalue_checks_are_seen_by_their_diagonal():

@@ -10,6 +10,7 @@ from oracles import dense_kalman, enumerate_modes, error, flat_model, textbook_i
 from saltus.filters import imm_filter
 from strategies import law, problems, quick, random_cov, random_problem, random_trans, rngs
 
+BACKENDS = ["numpy", None]  # the definition, and what the package chooses by itself
 ROUND_OFF = 1e-9  # the oracles subtract (R - K S K') and invert; condition numbers reach 1e4
 
 
@@ -22,10 +23,11 @@ def compare(est, run, oracle):
     np.testing.assert_allclose(est.log_likelihood[run], oracle.log_likelihood, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @quick
-@given(problems())
-def test_every_shape_of_argument_against_the_textbook_cycle_on_the_flat_chain(p):
-    est = imm_filter(**p, per_mode=True)
+@given(p=problems())
+def test_every_shape_of_argument_against_the_textbook_cycle_on_the_flat_chain(p, backend):
+    est = imm_filter(**p, per_mode=True, backend=backend)
     batch = p["z"].shape[:-2]
     for run in np.ndindex(batch):
         f = flat_model(p, run)
