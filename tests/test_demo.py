@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 import pyproj
 import pytest
 
-from saltus.demo import score_demo, write_demo
+from saltus.demo import run_demo, score_demo, write_demo
 from saltus.geo import wrap
 from saltus.simulate.scene import DURATION, demo_aircraft, demo_plane, demo_radars
 
@@ -92,6 +92,13 @@ def test_configuration_names_both_radars(demo):
         site = station.radar.site
         np.testing.assert_allclose(np.radians([entry["latitude"], entry["longitude"]]), [site.latitude, site.longitude])
         assert entry["height"] == site.height
+    # The fastest mode must hold the hardest turn, or its aircraft comes apart into several tracks.
+    t = np.arange(0.0, DURATION, 0.25)
+    hardest = max(
+        np.nanmax(np.abs(np.gradient(a.trajectory.at(t).velocity[:, :2], t, axis=0))) for a in demo_aircraft()
+    )
+    assert hardest <= max(config["filter"]["accel_h"]) * 1.01
+    assert len(config["filter"]["accel_h"]) == len(config["filter"]["sojourn_h"])
     (a, b) = (s.radar.site for s in demo_radars())
     _, _, distance = pyproj.Geod(ellps="WGS84").inv(*np.degrees([a.longitude, a.latitude, b.longitude, b.latitude]))
     assert 60e3 < distance < 100e3
@@ -124,9 +131,9 @@ def test_crossing_pair_is_a_thousand_feet_apart():
     np.testing.assert_allclose(gap[:, 2], 304.8)
 
 
-def test_the_seed_decides_every_byte(demo, tmp_path):
-    _, first = demo
-    again, other = write_demo(tmp_path / "a", 3), write_demo(tmp_path / "b", 4)
+def test_the_seed_decides_every_byte(tmp_path, monkeypatch):
+    monkeypatch.setattr("saltus.demo.DURATION", 30.0)
+    first, again, other = (write_demo(tmp_path / name, seed) for name, seed in (("a", 3), ("b", 3), ("c", 4)))
     assert [f.read_bytes() for f in again.files] == [f.read_bytes() for f in first.files]
     assert other.files[0].read_bytes() != first.files[0].read_bytes()
 
@@ -194,3 +201,20 @@ def test_no_tracks_at_all(demo):
     assert np.isnan(score.rmse).all()
     assert np.isnan(score.p_turning)
     assert score.false.n_false == 0
+
+
+def test_the_demonstration_tracks_what_it_simulates(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("saltus.demo.DURATION", 90.0)  # the first minute and a half of the scene
+    run_demo(tmp_path / "out", seed=1)
+    tracks = pq.read_table(tmp_path / "out" / "tracks.parquet")
+    assert set(tracks.column("status").to_pylist()) >= {"tentative", "confirmed"}
+    assert (tmp_path / "out" / "report.html").stat().st_size > 0
+    printed = capsys.readouterr().out
+    for craft in demo_aircraft():
+        (line,) = (x for x in printed.splitlines() if x.split()[:1] == [craft.name])
+        words = line.split()
+        n_tracks, share, rmse = int(words[-4]), float(words[-3]), float(words[-1])
+        assert n_tracks == 1
+        assert share > 95.0
+        assert rmse < 150.0  # the plots' own error reaches 120 m across the ray at 100 km and more
+    assert "False confirmed tracks:" in printed

@@ -59,7 +59,7 @@ def run_demo(output: Path, seed: int) -> None:
 
     from saltus.run import track_files
 
-    console = Console()
+    console = Console(highlight=False)
     console.print(f"Two radars, {len(demo_aircraft())} aircraft, {DURATION / 60:.0f} minutes, seed {seed}.")
     simulated = write_demo(output, seed)
     track_files(simulated.files, output, simulated.config, None, "use", None, None, report=True)
@@ -67,8 +67,9 @@ def run_demo(output: Path, seed: int) -> None:
     score = score_demo(tracks, pq.read_table(output / "assignments.parquet"), simulated.labels)
     console.print(_table(score))
     for line in _summary(score):
-        console.print(line)
-    console.print(f"Written to {output}: " + ", ".join(sorted(p.name for p in output.iterdir() if p.is_file())))
+        console.print(line, soft_wrap=True)
+    files = ", ".join(sorted(p.name for p in output.iterdir() if p.is_file()))
+    console.print(f"Written to {output}: {files}", soft_wrap=True)
 
 
 def write_demo(output: Path, seed: int) -> Simulated:
@@ -122,6 +123,13 @@ def _configuration(stations: Sequence[RadarStation]) -> str:
             f"longitude = {np.degrees(site.longitude):.8f}",
             f"height = {site.height:.1f}",
         ]
+    lines += [
+        "",
+        "# A third horizontal mode: one aircraft turns at 2.5 g.",
+        "[filter]",
+        "accel_h = [0.15, 4.0, 25.0]  # m/s^2, steady motion first",
+        "sojourn_h = [120.0, 25.0, 15.0]  # s, mean stay in each mode",
+    ]
     return "\n".join(lines) + "\n"
 
 
@@ -218,12 +226,12 @@ def _mean(values: npt.NDArray[np.float64]) -> float:
 
 
 def _table(score: Score) -> "Table":
+    from rich import box
     from rich.table import Table
 
-    table = Table(title="Aircraft and their confirmed tracks", title_justify="left")
-    table.add_column("aircraft")
-    table.add_column("what it does")
-    table.add_column("identity")
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for name in ("aircraft", "what it does", "mode"):
+        table.add_column(name)
     for name in ("plots", "tracks", "on tracks", "RMSE, m"):
         table.add_column(name, justify="right")
     at = {int(k): i for i, k in enumerate(score.tracks.objects)}
@@ -233,7 +241,7 @@ def _table(score: Score) -> "Table":
             cells = [str(score.n_plots[k]), str(n_tracks), f"{100 * share:.1f} %", f"{score.rmse[k]:.0f}"]
         else:
             cells = [str(score.n_plots[k]), "-", "-", "-"]
-        table.add_row(craft.name, craft.doing, "Mode S" if craft.icao24 >= 0 else "Mode A/C", *cells)
+        table.add_row(craft.name, craft.doing, "S" if craft.icao24 >= 0 else "A/C", *cells)
     return table
 
 

@@ -75,13 +75,11 @@ def _airways() -> tuple[Aircraft, ...]:
     return (
         Aircraft("SAL101", "overflight", _through((0, 28), 370, 95, 480, straight), 0o1101, 0x3C0101),
         Aircraft("SAL102", "overflight", _through((22, 0), 350, 3, 455, straight), 0o1102, 0x3C0102),
-        Aircraft(
-            "SAL103", "crosses SAL104, 1000 ft above", _through((8, -40), 330, 60, 450, straight), 0o1103, 0x3C0103
-        ),
-        Aircraft("SAL104", "crosses SAL103, 1000 ft below", _through((8, -40), 320, 320, 430, straight), 0o1104),
-        Aircraft("SAL105", "leads SAL106 by 5 NM", _through((-25, 55), 310, 110, 440, straight), 0o1105),
-        Aircraft("SAL106", "follows SAL105", _through((-33.7, 58.2), 310, 110, 440, straight), 0o1106),
-        Aircraft("SAL107", "overhead the radar West", _through((-35.4, -17.5), 180, 40, 330, straight), 0o1107),
+        Aircraft("SAL103", "1000 ft over SAL104", _through((8, -40), 330, 60, 450, straight), 0o1103, 0x3C0103),
+        Aircraft("SAL104", "1000 ft under SAL103", _through((8, -40), 320, 320, 430, straight), 0o1104),
+        Aircraft("SAL105", "5 NM ahead of SAL106", _through((-25, 55), 310, 110, 440, straight), 0o1105),
+        Aircraft("SAL106", "5 NM behind SAL105", _through((-33.7, 58.2), 310, 110, 440, straight), 0o1106),
+        Aircraft("SAL107", "over the radar West", _through((-35.4, -17.5), 180, 40, 330, straight), 0o1107),
     )
 
 
@@ -97,7 +95,7 @@ def _manoeuvring() -> tuple[Aircraft, ...]:
         ),
         Aircraft(
             "SAL109",
-            "fast, turns at 2.5 g and climbs",
+            "2.5 g turns, a climb",
             Trajectory(
                 _km(-70, -60, 150),
                 _deg(45),
@@ -116,7 +114,7 @@ def _manoeuvring() -> tuple[Aircraft, ...]:
         ),
         Aircraft(
             "SAL110",
-            "weaves at 25 degrees of bank",
+            "weaves, 25° of bank",
             Trajectory(
                 _km(60, 45, 240), _deg(230), weave, (Leg(60.0), sway, back, Leg(30.0), back, sway) * 3 + (Leg(300.0),)
             ),
@@ -124,7 +122,7 @@ def _manoeuvring() -> tuple[Aircraft, ...]:
         ),
         Aircraft(
             "SAL111",
-            "departs: climbs, turns, accelerates",
+            "departure",
             Trajectory(
                 _km(20, -10, 30),
                 _deg(80),
@@ -143,7 +141,7 @@ def _manoeuvring() -> tuple[Aircraft, ...]:
         ),
         Aircraft(
             "SAL112",
-            "arrives: descends, slows, turns",
+            "arrival",
             Trajectory(
                 _km(75, -45, 200),
                 _deg(290),
@@ -169,13 +167,13 @@ def _low_and_slow() -> tuple[Aircraft, ...]:
     return (
         Aircraft(
             "SAL113",
-            "light aircraft, circles twice",
+            "light, circles twice",
             Trajectory(_km(5, -22, 35), _deg(20), 105 * KNOT, (Leg(120.0), circle, Leg(90.0), circle, Leg(150.0))),
             0o7000,
         ),
         Aircraft(
             "SAL114",
-            "light aircraft, turns back",
+            "light, turns back",
             Trajectory(
                 _km(48, 30, 45), _deg(160), 120 * KNOT, (Leg(270.0), Leg(60.0, turn_rate=-_RATE_ONE), Leg(270.0))
             ),
