@@ -84,81 +84,47 @@ def _airways() -> tuple[Aircraft, ...]:
 
 
 def _manoeuvring() -> tuple[Aircraft, ...]:
-    hold, lap = 220 * KNOT, (Leg(60.0), Leg(60.0, turn_rate=_RATE_ONE))
-    fast, weave = 480 * KNOT, 300 * KNOT
-    pull = coordinated_turn(float(np.radians(150)), 25.0, fast)
-    sway = coordinated_turn(float(np.radians(60)), 4.5, weave)
-    back = coordinated_turn(float(np.radians(-60)), 4.5, weave)
+    hold, fast, weave = 220 * KNOT, 480 * KNOT, 300 * KNOT
+    racetrack = (Leg(60.0), Leg(60.0, turn_rate=_RATE_ONE)) * 5
+    right, left = (coordinated_turn(_deg(a), 25.0, fast) for a in (150, -120))
+    dash = (Leg(150.0), right, Leg(80.0, climb=40.0), Leg(60.0, climb=0.0), left, Leg(300.0))
+    sway, back = (coordinated_turn(_deg(a), 4.5, weave) for a in (60, -60))
+    wave = (Leg(60.0), sway, back, Leg(30.0), back, sway) * 3
     return (
         Aircraft(
-            "SAL108", "holding pattern", Trajectory(_km(-12, 12, 100), _deg(270), hold, lap * 5), 0o1110, 0x3C0108
+            "SAL108", "holding pattern", Trajectory(_km(-12, 12, 100), _deg(270), hold, racetrack), 0o1110, 0x3C0108
         ),
         Aircraft(
-            "SAL109",
-            "2.5 g turns, a climb",
-            Trajectory(
-                _km(-70, -60, 150),
-                _deg(45),
-                fast,
-                (
-                    Leg(150.0),
-                    pull,
-                    Leg(80.0, climb=40.0),
-                    Leg(60.0, climb=0.0),
-                    coordinated_turn(-2.1, 25.0, fast),
-                    Leg(300.0),
-                ),
-            ),
-            0o1111,
-            0x3C0109,
+            "SAL109", "2.5 g turns, a climb", Trajectory(_km(-70, -60, 150), _deg(45), fast, dash), 0o1111, 0x3C0109
         ),
-        Aircraft(
-            "SAL110",
-            "weaves, 25° of bank",
-            Trajectory(
-                _km(60, 45, 240), _deg(230), weave, (Leg(60.0), sway, back, Leg(30.0), back, sway) * 3 + (Leg(300.0),)
-            ),
-            0o1112,
-        ),
-        Aircraft(
-            "SAL111",
-            "departure",
-            Trajectory(
-                _km(20, -10, 30),
-                _deg(80),
-                170 * KNOT,
-                (
-                    Leg(40.0, climb=10.0),
-                    Leg(40.0, acceleration=1.0),
-                    Leg(30.0, turn_rate=-_RATE_ONE, climb=12.0),
-                    Leg(90.0, acceleration=0.6),
-                    Leg(180.0, climb=8.0),
-                    Leg(220.0, climb=0.0),
-                ),
-            ),
-            0o1113,
-            0x3C0111,
-        ),
-        Aircraft(
-            "SAL112",
-            "arrival",
-            Trajectory(
-                _km(75, -45, 200),
-                _deg(290),
-                350 * KNOT,
-                (
-                    Leg(60.0),
-                    Leg(180.0, climb=-10.0),
-                    Leg(80.0, acceleration=-0.7, climb=-8.0),
-                    Leg(20.0, turn_rate=_RATE_ONE),
-                    Leg(120.0, climb=-6.0),
-                    Leg(40.0, turn_rate=-_RATE_ONE, climb=0.0),
-                    Leg(100.0),
-                ),
-            ),
-            0o1114,
-            0x3C0112,
-        ),
+        Aircraft("SAL110", "weaves, 25° of bank", Trajectory(_km(60, 45, 240), _deg(230), weave, wave), 0o1112),
+        *_terminal(),
+    )
+
+
+def _terminal() -> tuple[Aircraft, ...]:
+    departure = (
+        Leg(40.0, climb=10.0),
+        Leg(40.0, acceleration=1.0),
+        Leg(30.0, turn_rate=-_RATE_ONE, climb=12.0),
+        Leg(90.0, acceleration=0.6),
+        Leg(180.0, climb=8.0),
+        Leg(220.0, climb=0.0),
+    )
+    arrival = (
+        Leg(60.0),
+        Leg(180.0, climb=-10.0),
+        Leg(80.0, acceleration=-0.7, climb=-8.0),
+        Leg(20.0, turn_rate=_RATE_ONE),
+        Leg(120.0, climb=-6.0),
+        Leg(40.0, turn_rate=-_RATE_ONE, climb=0.0),
+        Leg(100.0),
+    )
+    out = Trajectory(_km(20, -10, 30), _deg(80), 170 * KNOT, departure)
+    home = Trajectory(_km(75, -45, 200), _deg(290), 350 * KNOT, arrival)
+    return (
+        Aircraft("SAL111", "departure", out, 0o1113, 0x3C0111),
+        Aircraft("SAL112", "arrival", home, 0o1114, 0x3C0112),
     )
 
 
