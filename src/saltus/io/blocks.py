@@ -47,13 +47,15 @@ def frame_plain(data: bytes, name: str) -> tuple[list[Block], list[str]]:
         The blocks, and what was skipped.
     """
     blocks = []
+    nan = float("nan")
     position = 0
     while position < len(data):
-        length = _length(data, position)
-        if length <= _HEADER or position + length > len(data):
+        length = int.from_bytes(data[position + 1 : position + 3], "big")
+        stop = position + length
+        if length <= _HEADER or stop > len(data):
             return _frame_doubtful(data, name)
-        blocks.append(_block(data, position, position + length))
-        position += length
+        blocks.append(Block(data[position], position, data[position:stop], nan, False))
+        position = stop
     if len(blocks) < _CHAIN and any(b.category not in categories() for b in blocks):
         return _frame_doubtful(data, name)
     return blocks, []
@@ -67,7 +69,7 @@ def frame_capture(data: bytes, name: str) -> tuple[list[Block], list[str]]:
     for packet in packets:
         position, payload = 0, packet.payload
         while position < len(payload):
-            length = _length(payload, position)
+            length = int.from_bytes(payload[position + 1 : position + 3], "big")
             if length <= _HEADER or position + length > len(payload):
                 if position == 0:
                     foreign.append(packet.offset)

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 __all__ = ["Field", "Layout", "Malformed", "categories", "edition_name", "layout"]
 
-Measure = Callable[[bytes, int, int], int]  # (data, start, end) -> where the item stops; raises Malformed
+# Length of an item: bytes, or (data, start, end) -> where the item stops, which raises Malformed.
+Measure = int | Callable[[bytes, int, int], int]
 
 _SI = {"NM": 1852.0, "°": np.pi / 180, "s": 1.0, "FL": 30.48, "ft": 0.3048, "m": 1.0, "m/s": 1.0, "ft/min": 0.00508}
 
@@ -81,7 +82,7 @@ class Layout:
             plan = self._plans[fspec] = _flagged(fspec, self._items, start)
         spans = {}
         for name, measure in plan:
-            stop = measure(data, position, end)
+            stop = position + measure if isinstance(measure, int) else measure(data, position, end)
             if stop > end:
                 raise Malformed(position, f"item {name} needs {stop - position} bytes, {end - position} are left")
             spans[name] = (position, stop)
@@ -117,7 +118,7 @@ class Layout:
         variation = _variation(self._record.cv_items_dict[item])
         fspec, position = _fspec(data, 0, len(data), variation.cv_fspec_max_bytes)
         for label, measure in _flagged(fspec, _compound_items(variation), 0):
-            stop = measure(data, position, len(data))
+            stop = _stop(measure, data, position, len(data))
             if label == name:
                 return data[position:stop]
             position = stop
@@ -130,7 +131,7 @@ class Layout:
             entry = self._items[frn - 1] if 0 < frn <= len(self._items) else None
             if entry is None or entry[0] == "RFS":
                 raise Malformed(position, f"random field sequencing names item {frn}, which is not defined")
-            position = entry[1](data, position + 1, end)
+            position = _stop(entry[1], data, position + 1, end)
         return position
 
 
@@ -170,6 +171,10 @@ def _base() -> Any:
 def _variation(non_spare: Any) -> Any:
     rule = non_spare.cv_rule
     return rule.cv_variation if hasattr(rule, "cv_variation") else rule.cv_default_variation
+
+
+def _stop(measure: Measure, data: bytes, start: int, end: int) -> int:
+    return start + measure if isinstance(measure, int) else measure(data, start, end)
 
 
 def _byte(data: bytes, position: int, end: int) -> int:
@@ -215,7 +220,7 @@ def _bits(variation: Any) -> int:
 def _measure(variation: Any) -> Measure:
     base = _base()
     if issubclass(variation, base.Element | base.Group):
-        return _measure_fixed(_bits(variation) // 8)
+        return _bits(variation) // 8
     if issubclass(variation, base.Extended):
         return _measure_extended(variation)
     if issubclass(variation, base.Repetitive):
@@ -223,13 +228,6 @@ def _measure(variation: Any) -> Measure:
     if issubclass(variation, base.Explicit):
         return _measure_explicit
     return _measure_compound(variation)
-
-
-def _measure_fixed(n_bytes: int) -> Measure:
-    def measure(data: bytes, start: int, end: int) -> int:
-        return start + n_bytes
-
-    return measure
 
 
 def _measure_extended(variation: Any) -> Measure:
@@ -242,7 +240,11 @@ def _measure_extended(variation: Any) -> Measure:
         position = start
         for n_bytes, extends in parts:
             position += n_bytes
-            if not extends or not _byte(data, position - 1, end) & 1:
+            if not extends:
+                return position
+            if position > end:
+                raise Malformed(start, "the record ends within an item")
+            if not data[position - 1] & 1:
                 return position
         raise Malformed(start, "an item extends beyond its definition")
 
@@ -271,7 +273,7 @@ def _measure_repetitive(variation: Any) -> Measure:
         if n_bytes:
             return position + count * n_bytes
         for _ in range(count):
-            position = each(data, position, end)
+            position = _stop(each, data, position, end)
         return position
 
     return measure
@@ -284,6 +286,7 @@ def _measure_explicit(data: bytes, start: int, end: int) -> int:
     return start + length
 
 
+@cache
 def _compound_items(variation: Any) -> list[tuple[str, Measure] | None]:
     return [None if sub is None else (sub.cv_name, _measure(_variation(sub))) for sub in variation.cv_items_list]
 
@@ -299,7 +302,7 @@ def _measure_compound(variation: Any) -> Measure:
         if plan is None:
             plan = plans[fspec] = _flagged(fspec, items, start)
         for name, each in plan:
-            stop = each(data, position, end)
+            stop = position + each if isinstance(each, int) else each(data, position, end)
             if stop > end:
                 raise Malformed(position, f"part {name} needs {stop - position} bytes, {end - position} are left")
             position = stop

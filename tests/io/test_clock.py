@@ -1,0 +1,92 @@
+"""Midnight, late reports and clocks that jump."""
+
+import numpy as np
+import pytest
+
+from saltus.io.clock import day_offsets, order_faults
+
+
+def test_midnight_counts_on():
+    tod = np.array([86398.0, 86399.5, 0.5, 2.0])
+    assert day_offsets(tod).tolist() == [0, 0, 1, 1]
+
+
+def test_late_reports_around_midnight_stay_on_their_day():
+    tod = np.array([86399.0, 0.1, 86399.8, 0.3, np.nan, 86399.9, 0.4])
+    assert day_offsets(tod).tolist() == [0, 1, 0, 1, 0, 0, 1]
+
+
+def test_two_midnights():
+    tod = np.arange(0.0, 2.5 * 86400, 600.0)
+    assert day_offsets(tod % 86400).tolist() == (tod // 86400).astype(int).tolist()
+
+
+@pytest.mark.parametrize("wild", [[80000.0], [50000.0, 7000.0], [60000.0, 20000.0, 70000.0]])
+def test_wild_times_start_no_day(wild):
+    tod = np.concatenate([np.arange(100.0, 120.0), wild, np.arange(120.0, 140.0)])
+    days = day_offsets(tod)
+    assert not np.any(days[:20]) and not np.any(days[-20:])
+
+
+def test_wild_first_time_starts_no_day():
+    tod = np.concatenate([[60000.0], np.arange(100.0, 120.0)])
+    assert not np.any(day_offsets(tod)[1:])
+
+
+def test_within_the_window_all_is_well():
+    time = np.array([0.0, 1.9, 0.0, 3.0, 1.0, 4.0])
+    late, jump, steps = order_faults(time)
+    assert not late.any() and not jump.any() and steps == ()
+
+
+def test_a_late_report_is_late_and_nothing_else():
+    time = np.arange(0.0, 60.0)
+    time[30] = 20.0
+    late, jump, steps = order_faults(time)
+    assert np.flatnonzero(late).tolist() == [30]
+    assert not jump.any() and steps == ()
+
+
+@pytest.mark.parametrize("wild", [5000.0, -5000.0, 100.0])
+@pytest.mark.parametrize("where", [0, 1, 30, 58, 59])
+def test_one_wild_time_does_not_touch_its_neighbours(wild, where):
+    time = np.arange(1000.0, 1060.0)
+    time[where] += wild
+    late, jump, steps = order_faults(time)
+    expected = [where]
+    if where == 59 and wild == 100.0:
+        expected = []  # the last report of a file 100 s ahead may as well follow a gap
+    if where == 0 and wild < 0:
+        expected = []  # a first report long before the others may as well precede a gap
+    assert np.flatnonzero(late | jump).tolist() == expected
+    assert steps == ()
+
+
+def test_a_gap_is_no_fault():
+    time = np.concatenate([np.arange(0.0, 50.0), np.arange(5000.0, 5050.0)])
+    late, jump, steps = order_faults(time)
+    assert not late.any() and not jump.any() and steps == ()
+
+
+def test_a_clock_set_back_for_good_keeps_the_rest():
+    """40 s after the start it is set back by 10 s: what it repeats, 30 to 40 s, is dropped from the earlier part."""
+    time = np.concatenate([np.arange(0.0, 40.0, 0.1), np.arange(30.0, 80.0, 0.1)])
+    late, jump, steps = order_faults(time)
+    assert steps == (400,)
+    assert not late.any() and not jump[400:].any()
+    assert np.flatnonzero(jump).tolist() == list(range(300, 400))
+
+
+def test_a_clock_set_back_before_the_start_loses_nothing():
+    time = np.concatenate([np.arange(3600.0, 3700.0), np.arange(0.0, 100.0)])
+    late, jump, steps = order_faults(time)
+    assert steps == (100,)
+    assert not late.any() and not jump.any()
+
+
+def test_a_passing_leap_ahead_is_dropped():
+    time = np.arange(0.0, 200.0)
+    time[60:90] += 1000.0
+    late, jump, steps = order_faults(time)
+    assert np.flatnonzero(jump).tolist() == list(range(60, 90))
+    assert not late.any() and steps == ()
