@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from saltus.errors import DataError
+from saltus.io.capture import CAPTURE_MAGIC
 from saltus.io.merge import merge
 from saltus.io.part import Part
 from saltus.records import Recording
@@ -45,11 +46,9 @@ def _parquet(path: Path, date: datetime.date | None, editions: Mapping[int, str]
     return read_parquet(path)
 
 
-_PCAP = (b"\xa1\xb2\xc3\xd4", b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x4d\x3c\xb2\xa1", b"\x0a\x0d\x0d\x0a")
-
 FORMATS = (
     Format("Parquet table", (".parquet", ".pq"), (b"PAR1",), _parquet),
-    Format("packet capture", (".pcap", ".pcapng", ".cap"), _PCAP, _asterix),
+    Format("packet capture", (".pcap", ".pcapng", ".cap"), CAPTURE_MAGIC, _asterix),
     Format("ASTERIX", (".ast", ".raw", ".asterix"), (), _asterix),
     Format("CSV table", (".csv",), (), _csv),
 )

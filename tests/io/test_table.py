@@ -1,0 +1,167 @@
+"""Tables as CSV and Parquet: documented columns, and messages with row and column."""
+
+import datetime
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from saltus.errors import DataError
+from saltus.io import read
+from saltus.records import REASONS, Kind
+
+NOON = datetime.datetime(2024, 5, 1, 12, tzinfo=datetime.UTC).timestamp()
+
+
+def csv(tmp_path, text):
+    (tmp_path / "t.csv").write_text(text)
+    return read([tmp_path / "t.csv"])
+
+
+def parquet(tmp_path, **columns):
+    pq.write_table(pa.table(columns), tmp_path / "t.parquet")
+    return read([tmp_path / "t.parquet"])
+
+
+def reasons(got):
+    return {int(r): REASONS[c] for r, c in zip(got.plots.record, got.plots.reason, strict=True)}
+
+
+def test_polar_csv(tmp_path):
+    got = csv(
+        tmp_path,
+        "time,range_m,azimuth_deg,altitude_m,icao24,mode3a,callsign,on_ground,source\n"
+        "2024-05-01T12:00:00Z,1000,90,3048,3c6444,1234,DLH1,false,A\n"
+        "2024-05-01 14:00:01+02:00,2000,270,,,,,,B\n",
+    )
+    p = got.plots
+    assert p.time.tolist() == [NOON, NOON + 1]
+    assert p.range.tolist() == [1000.0, 2000.0]
+    np.testing.assert_allclose(p.azimuth, [np.pi / 2, 3 * np.pi / 2], rtol=1e-15)
+    assert (p.icao24.tolist(), p.mode3a.tolist()) == ([0x3C6444, -1], [0o1234, -1])
+    assert (p.callsign.tolist(), p.on_ground.tolist()) == (["DLH1", ""], [0, -1])
+    assert [s.system.name for s in p.sources] == ["A", "B"]
+    assert got.problems == ()
+    assert [c.n_reports for c in got.contents] == [1, 1]
+
+
+def test_each_row_takes_the_position_it_has(tmp_path):
+    got = csv(tmp_path, "time,x_m,y_m,lat,lon\n1e9,1,2,,\n1000000001,,,41,2\n1000000002,,,,\n1000000003,1,,,\n")
+    assert got.plots.kind.tolist() == [Kind.PLANE, Kind.GEODETIC, Kind.NONE, Kind.PLANE]
+    assert reasons(got) == {0: "", 1: "", 2: "no position", 3: "not a number"}
+
+
+def test_float32_becomes_float64_before_anything(tmp_path):
+    degrees = np.array([41.30069956], np.float32)
+    got = parquet(
+        tmp_path,
+        time=np.array([NOON]),
+        latitude=degrees,
+        longitude=degrees,
+        altitude_m=np.array([1000.1], np.float32),
+    )
+    assert got.plots.latitude.dtype == np.float64
+    assert got.plots.latitude[0] == np.float64(degrees[0]) * (np.pi / 180)
+
+
+def test_parquet_types(tmp_path):
+    got = parquet(
+        tmp_path,
+        time=pa.array([datetime.datetime(2024, 5, 1, 12, 0, 0, 500000)], pa.timestamp("ms")),
+        latitude=pa.array([41], pa.int16()),
+        longitude=pa.array([2.0]),
+        onground=pa.array([True]),
+        icao24=pa.array(["abcdef"]).dictionary_encode(),
+        extra=pa.array([1]),
+    )
+    assert got.plots.time[0] == NOON + 0.5
+    assert (got.plots.on_ground[0], got.plots.icao24[0]) == (1, 0xABCDEF)
+    assert got.contents[0].notes == ("columns not used: extra",)
+
+
+def test_rows_in_any_order(tmp_path):
+    got = csv(tmp_path, "time,x_m,y_m\n1000000100,1,1\n1000000000,2,2\n1000000050,3,3\n")
+    assert got.plots.record.tolist() == [1, 2, 0]
+    assert np.all(got.plots.reason == 0)
+
+
+def test_bad_cells_name_row_and_column_and_the_rest_is_kept(tmp_path):
+    got = csv(
+        tmp_path,
+        "time,latitude,longitude,altitude_m,icao24,mode3a,on_ground\n"
+        "1000000000,41,2,100,zzz,8888,maybe\n"
+        "yesterday,41,2,100,,,\n"
+        "1000000002,north,2,100,,,\n"
+        "1000000003,413,2,100,,,\n"
+        "1000000004,41,2,1e6,,,\n"
+        "1000000005,nan,2,100,,,\n"
+        "1000000006,41,inf,100,,,\n"
+        "1000000007,41,2,100,,,\n"
+        "1000000008,41,2.1,100,,,\n"
+        "1000000009,41,2.1,100,,,\n",
+    )
+    assert reasons(got) == {
+        0: "",
+        1: "no time",
+        2: "not a number",
+        3: "out of range",
+        4: "out of range",
+        5: "not a number",
+        6: "out of range",
+        7: "",
+        8: "",
+        9: "",
+    }
+    text = "\n".join(got.problems)
+    for part in (
+        "t.csv: row 0, column 'icao24': 'zzz' is no hexadecimal code",
+        "t.csv: row 0, column 'mode3a': '8888' is no octal code",
+        "t.csv: row 0, column 'on_ground': 'maybe'",
+        "t.csv: row 1, column 'time': 'yesterday'",
+        "t.csv: row 2, column 'latitude': 'north' is no number",
+        "t.csv: row 3, column 'latitude': '413' is out of range",
+        "t.csv: row 4, column 'altitude_m': '1e+06' is out of range",
+    ):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "t.csv: byte 0: the file is empty"),
+        ("time,x_m,y_m\n", "has columns and no row"),
+        ("x_m,y_m\n1,2\n", "no column for time"),
+        ("time,range_m\n1,2\n", "no column for a position: range_m and azimuth_deg"),
+        ("time,x_m,y_m\n1000,1\n", "no readable CSV"),
+        ("time,x_m,x_m,y_m\n1,1,1,1\n", "column 'x_m' occurs 2 times"),
+        ("time,range_m,azimuth_deg\n1e9,1,5000\n", r"row 0, column 'azimuth_deg': 5000 cannot be.*degrees"),
+        ("time,latitude,longitude\n1e9,4.1e6,2\n", r"row 0, column 'latitude': 4\.1e\+06 cannot be"),
+        ("time,x_m,y_m\n1714564800000,1,2\n", r"column 'time': .*milliseconds"),
+    ],
+)
+def test_tables_that_cannot_be_used(tmp_path, text, message):
+    with pytest.raises(DataError, match=message):
+        csv(tmp_path, text)
+
+
+def test_parquet_that_cannot_be_used(tmp_path):
+    (tmp_path / "t.parquet").write_bytes(b"PAR1 and nothing else")
+    with pytest.raises(DataError, match=r"t\.parquet: no readable Parquet"):
+        read([tmp_path / "t.parquet"])
+    with pytest.raises(DataError, match="give octal digits as text"):
+        parquet(tmp_path, time=[1e9], x_m=[1.0], y_m=[1.0], mode3a=[1200])
+
+
+def test_nothing_and_directories(tmp_path):
+    with pytest.raises(DataError, match="no input given"):
+        read([])
+    with pytest.raises(DataError, match="is a directory"):
+        read([tmp_path])
+
+
+def test_opensky_tables(recordings):
+    got = read([recordings / "adsb_opensky" / "switzerland.parquet"])
+    assert len(got.plots) == 97873
+    assert np.all(got.plots.reason == 0)
+    assert got.contents[0].update_period == pytest.approx(10.0, abs=1.0)
