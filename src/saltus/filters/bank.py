@@ -1,6 +1,7 @@
 """Many multimode filters at once: rows that are added, stepped, scored, updated and removed as arrays."""
 
 from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
@@ -8,9 +9,10 @@ from jaxtyping import Float, Int
 
 from saltus.errors import ModelError
 from saltus.filters import steps
+from saltus.filters.backend import Backend, use_native
 from saltus.filters.steps import Belief
 
-__all__ = ["Bank"]
+__all__ = ["Bank", "NumpyStore"]
 
 _Rows = npt.NDArray[np.intp]
 _Array = npt.NDArray[np.float64]
@@ -26,25 +28,25 @@ class Bank:
     A row number is valid from `add` until `remove`; freed rows are used again.
     """
 
-    def __init__(self, n: int, sizes: tuple[int, ...], capacity: int = 64) -> None:
+    def __init__(self, n: int, sizes: tuple[int, ...], capacity: int = 64, backend: Backend | None = None) -> None:
         """Make an empty bank.
 
         Args:
             n: number of continuous states.
             sizes: number of states of each chain; () is a bank of Kalman filters.
             capacity: rows to allocate; the bank grows by doubling.
+            backend: "numpy" for the definition, "native" for its compiled twin; None chooses.
         """
         if n < 1 or any(s < 1 for s in sizes):
             raise ModelError(f"a Bank needs n >= 1 and chains of at least one state, got n={n}, sizes={sizes}.")
-        self.n, self.sizes = n, tuple(sizes)
-        self._log_probs = np.zeros((capacity, *self.sizes))
-        self._means = np.zeros((capacity, *self.sizes, n))
-        self._covs = np.zeros((capacity, *self.sizes, n, n))
+        self.n, self.sizes, self.backend = n, tuple(sizes), backend
+        self._store = _make_store(n, self.sizes, capacity, backend)
+        self._capacity = capacity
         self._free: list[int] = list(range(capacity - 1, -1, -1))
 
     def __len__(self) -> int:
         """Number of rows in use."""
-        return len(self._log_probs) - len(self._free)
+        return self._capacity - len(self._free)
 
     def add(self, belief: Belief) -> Int[np.ndarray, " k"]:
         """Store beliefs with one leading axis (k, M1, ..., MC[, n[, n]]) and return their row numbers."""
@@ -61,26 +63,26 @@ class Bank:
 
     def read(self, rows: _Rows) -> Belief:
         """Return copies of the rows' beliefs."""
-        return Belief(self._log_probs[rows], self._means[rows], self._covs[rows])
+        return self._store.read(rows)
 
     def write(self, rows: _Rows, belief: Belief) -> None:
         """Overwrite rows."""
-        self._log_probs[rows], self._means[rows], self._covs[rows] = belief
+        self._store.write(rows, belief)
 
     def take(self, rows: _Rows) -> "Bank":
         """Return a new bank whose rows 0..k-1 are copies of `rows` (repeats allowed: hypotheses, resampling)."""
-        bank = Bank(self.n, self.sizes, capacity=0)
-        bank._log_probs, bank._means, bank._covs = self.read(rows)
+        bank = Bank(self.n, self.sizes, len(rows), self.backend)
+        bank._free.clear()
+        bank._store.copy_from(np.arange(len(rows)), self._store, rows)
         return bank
 
     def put(self, rows: _Rows, other: "Bank", other_rows: _Rows) -> None:
         """Overwrite `rows` with copies of another bank's rows."""
-        self.write(rows, other.read(other_rows))
+        self._store.copy_from(rows, other._store, other_rows)
 
     def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None:
         """Mix and propagate rows over their intervals (no row twice)."""
-        log_probs, means, covs = steps.mix(*self.read(rows), trans)
-        self.write(rows, Belief(log_probs, *steps.propagate(means, covs, F, b, Q)))
+        self._store.step(rows, trans, F, b, Q)
 
     def score(
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array
@@ -88,47 +90,112 @@ class Bank:
         """Return gate distance d2 and log f(z) of measurement z[i] for row rows[i] (repeats allowed).
 
         d2 is the squared Mahalanobis distance to the mixture's predicted measurement; NaN components count not.
+
+        Raises:
+            NumericalError: an innovation covariance is not positive definite.
         """
-        _, d2, log_f = self._condition(rows, z, H, d, R)
-        return d2, log_f
+        return self._store.measure(rows, z, H, d, R, write=False)
 
     def update(
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Condition row rows[i] on z[i] (no row twice); return d2 and log f(z) as `score` does."""
-        belief, d2, log_f = self._condition(rows, z, H, d, R)
-        self.write(rows, belief)
-        return d2, log_f
+        """Condition row rows[i] on z[i] (no row twice); return d2 and log f(z) as `score` does.
+
+        Raises:
+            NumericalError: an innovation covariance is not positive definite; what the rows hold is then undefined.
+        """
+        return self._store.measure(rows, z, H, d, R, write=True)
 
     def moments(
         self, rows: _Rows
     ) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n n"], Float[np.ndarray, "k *_sizes"]]:
         """Return mean, covariance and mode probabilities of rows."""
-        belief = self.read(rows)
-        mean, cov = steps.collapse(*belief, len(self.sizes))
-        return mean, cov, np.exp(belief.log_probs)
-
-    def _condition(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array
-    ) -> tuple[Belief, _Array, _Array]:
-        log_probs, means, covs = self.read(rows)
-        n_chains = len(self.sizes)
-        seen = ~np.isnan(z)
-        z = np.where(seen, z, 0.0)
-        shape = (len(rows),) + (1,) * n_chains + z.shape[-1:]
-        prediction = steps.measure(means, covs, H, d, R)
-        done = steps.condition(prediction, z.reshape(shape), seen.reshape(shape))
-        d2 = steps.mixture_nis(log_probs, prediction, z, seen, n_chains)
-        log_probs, log_f = steps.reweigh(log_probs, done.loglik, n_chains)
-        return Belief(log_probs, done.mean, done.cov), d2, log_f
+        return self._store.moments(rows)
 
     def _grow(self) -> None:
-        old = len(self._log_probs)
-        new = max(8, 2 * old)
-        self._log_probs = _enlarged(self._log_probs, new)
-        self._means = _enlarged(self._means, new)
-        self._covs = _enlarged(self._covs, new)
-        self._free.extend(range(new - 1, old - 1, -1))
+        old = self._capacity
+        self._capacity = max(8, 2 * old)
+        self._store.grow(self._capacity)
+        self._free.extend(range(self._capacity - 1, old - 1, -1))
+
+
+@runtime_checkable
+class _Store(Protocol):
+    """Where a bank keeps its rows, and what can be done to them. Two stores that meet are of one kind."""
+
+    def grow(self, capacity: int) -> None: ...
+    def read(self, rows: _Rows) -> Belief: ...
+    def write(self, rows: _Rows, belief: Belief) -> None: ...
+    def copy_from(self, rows: _Rows, other: Any, other_rows: _Rows) -> None: ...
+    def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None: ...
+    def measure(
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, write: bool
+    ) -> tuple[_Array, _Array]: ...
+    def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]: ...
+
+
+def _make_store(n: int, sizes: tuple[int, ...], capacity: int, backend: Backend | None) -> _Store:
+    if use_native(backend):
+        from saltus.filters.native import NativeStore
+
+        return NativeStore(n, sizes, capacity)
+    return NumpyStore(n, sizes, capacity)
+
+
+class NumpyStore:
+    """Rows of NumPy arrays, (capacity, M1, ..., MC[, n[, n]]): the definition."""
+
+    def __init__(self, n: int, sizes: tuple[int, ...], capacity: int) -> None:
+        """Make room for `capacity` rows."""
+        self._n_chains = len(sizes)
+        self._log_probs = np.zeros((capacity, *sizes))
+        self._means = np.zeros((capacity, *sizes, n))
+        self._covs = np.zeros((capacity, *sizes, n, n))
+
+    def grow(self, capacity: int) -> None:
+        """Make room for more rows."""
+        self._log_probs = _enlarged(self._log_probs, capacity)
+        self._means = _enlarged(self._means, capacity)
+        self._covs = _enlarged(self._covs, capacity)
+
+    def read(self, rows: _Rows) -> Belief:
+        """Return copies of the rows' beliefs."""
+        return Belief(self._log_probs[rows], self._means[rows], self._covs[rows])
+
+    def write(self, rows: _Rows, belief: Belief) -> None:
+        """Overwrite rows."""
+        self._log_probs[rows], self._means[rows], self._covs[rows] = belief
+
+    def copy_from(self, rows: _Rows, other: "NumpyStore", other_rows: _Rows) -> None:
+        """Overwrite rows with those of another store."""
+        self.write(rows, other.read(other_rows))
+
+    def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None:
+        """Mix and propagate rows."""
+        log_probs, means, covs = steps.mix(*self.read(rows), trans)
+        self.write(rows, Belief(log_probs, *steps.propagate(means, covs, F, b, Q)))
+
+    def measure(
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, write: bool
+    ) -> tuple[_Array, _Array]:
+        """Return d2 and log f(z); condition the rows when `write`."""
+        log_probs, means, covs = self.read(rows)
+        seen = ~np.isnan(z)
+        z = np.where(seen, z, 0.0)
+        shape = (len(rows),) + (1,) * self._n_chains + z.shape[-1:]
+        prediction = steps.measure(means, covs, H, d, R)
+        done = steps.condition(prediction, z.reshape(shape), seen.reshape(shape))
+        d2 = steps.mixture_nis(log_probs, prediction, z, seen, self._n_chains)
+        log_probs, log_f = steps.reweigh(log_probs, done.loglik, self._n_chains)
+        if write:
+            self.write(rows, Belief(log_probs, done.mean, done.cov))
+        return d2, log_f
+
+    def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]:
+        """Return mean, covariance and mode probabilities of rows."""
+        belief = self.read(rows)
+        mean, cov = steps.collapse(*belief, self._n_chains)
+        return mean, cov, np.exp(belief.log_probs)
 
 
 def _enlarged(a: _Array, rows: int) -> _Array:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from saltus.errors import ModelError
 from saltus.filters import steps
 from saltus.filters.align import Aligned, align
+from saltus.filters.backend import Backend, use_native
 from saltus.filters.estimates import Estimates
 
 __all__ = ["imm_filter"]
@@ -33,7 +34,7 @@ def imm_filter(
     d: npt.ArrayLike | None = None,
     per_mode: bool = False,
     keep: Literal["all", "last"] = "all",
-    backend: Literal["numpy"] | None = None,
+    backend: Backend | None = None,
     num_threads: int | None = None,
 ) -> Estimates:
     """Filter measurements of a system whose matrices depend on hidden Markov chains.
@@ -58,8 +59,8 @@ def imm_filter(
         d: known measurement offset, (..., m).
         per_mode: also return every mode's mean and covariance.
         keep: "all" rows, or the "last" row only (T axis of length 1) with the log-likelihood of every row.
-        backend: "numpy" for this definition; None chooses.
-        num_threads: threads for a compiled backend.
+        backend: "numpy" for this definition, "native" for its compiled twin; None chooses.
+        num_threads: threads for the compiled twin; None takes the cores this process may use. Results are the same.
 
     Returns:
         Estimates with rows at the times of z.
@@ -73,10 +74,13 @@ def imm_filter(
     """
     if keep not in ("all", "last"):
         raise ModelError(f'keep is "all" or "last", not {keep!r}.')
-    if backend not in (None, "numpy"):
-        raise ModelError(f'backend is None or "numpy", not {backend!r}.')
-    del num_threads
+    native = use_native(backend)
     model = align(z, F=F, Q=Q, H=H, R=R, trans=trans, mean0=mean0, cov0=cov0, probs0=probs0, b=b, d=d)
+    if native:
+        from saltus.filters.native import filter_native
+
+        measured = np.asarray(z, dtype=np.float64)
+        return filter_native(measured, model, per_mode=per_mode, every=keep == "all", num_threads=num_threads)
     return _filter(model, per_mode=per_mode, every=keep == "all")
 
 

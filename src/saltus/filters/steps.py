@@ -20,6 +20,7 @@ from saltus.errors import NumericalError
 from saltus.linalg import gaussian_terms, logsumexp, quadratic_form, symmetric
 
 __all__ = [
+    "NOT_POSITIVE",
     "Belief",
     "Conditioned",
     "Joint",
@@ -33,6 +34,10 @@ __all__ = [
     "reweigh",
 ]
 
+NOT_POSITIVE = (
+    "an innovation covariance S = H P H' + R is not positive definite: some measured component has "
+    "neither noise nor uncertainty. Give every measured component a positive variance in R."
+)
 _LOG_2PI = float(np.log(2.0 * np.pi))
 _FLOOR = 1e-290  # keeps the moments of a mode of probability zero defined, and touches nothing else
 
@@ -202,10 +207,7 @@ def condition(
     try:
         d2, logdet, L_inv = gaussian_terms(nu, S)
     except np.linalg.LinAlgError as error:
-        raise NumericalError(
-            "an innovation covariance S = H P H' + R is not positive definite: some measured component has "
-            "neither noise nor uncertainty. Give every measured component a positive variance in R."
-        ) from error
+        raise NumericalError(NOT_POSITIVE) from error
     K = U @ L_inv.swapaxes(-1, -2) @ L_inv
     gain = np.concatenate([np.broadcast_to(np.eye(n), (*K.shape[:-1], n)), -K], axis=-1)
     on_all = np.concatenate([np.ones((*on.shape[:-1], n)), on], axis=-1)

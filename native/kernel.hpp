@@ -1,0 +1,71 @@
+// What the binding and the units compiled per instruction set tell each other. Plain structs: no inline code to share.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+namespace saltus {
+
+// A model array (rows | 1, T | 1, M1 | 1, ..., MC | 1, core), C contiguous. Absent axes have stride 0; `rows` maps a
+// track to its row where that is not the track's own number. Mode j has its elements at which[j] * core.
+struct Model {
+  const double* data = nullptr;
+  const std::int64_t* rows = nullptr;
+  std::ptrdiff_t row = 0, time = 0;  // strides, in doubles
+  int distinct = 1, core = 1;
+  const int* which = nullptr;
+};
+
+enum Status : int { kFine = 0, kNotPositive = 1, kInfinite = 2 };
+
+struct Problem {
+  std::ptrdiff_t n_tracks = 0, n_steps = 0;
+  int n = 0, m = 0, modes = 1, chains = 0;
+  const int* sizes = nullptr;
+  const double* z = nullptr;  // (tracks, T, m), NaN where missing
+  Model F, b, Q, H, d, R;
+  const Model* trans = nullptr;  // one per chain; data is null where the chain cannot switch
+  Model log_probs0, mean0, cov0;
+  bool every = true;  // all rows, or the last one only
+  // (tracks, rows, ...); the modes' moments are null unless wanted, log_likelihood always has every row.
+  double *probs = nullptr, *mean = nullptr, *cov = nullptr, *log_likelihood = nullptr, *nis = nullptr;
+  double *n_observed = nullptr, *mode_means = nullptr, *mode_covs = nullptr;
+};
+
+// Tracks in lanes: block r / lanes holds [log P(modes) | a record per mode], each element once per lane.
+struct Tracks {
+  double* data = nullptr;
+  int n = 0, modes = 1, chains = 0;
+  const int* sizes = nullptr;
+};
+
+struct Rows {
+  const std::int64_t* index = nullptr;
+  std::ptrdiff_t count = 0;
+};
+
+// One instruction set. Workspaces are counted in doubles and aligned to 64 bytes by the caller.
+struct Kernel {
+  const char* name;
+  int lanes;
+  std::size_t (*filter_workspace)(const Problem&);
+  int (*filter)(const Problem&, std::ptrdiff_t first_block, std::ptrdiff_t last_block, double* workspace);
+  std::size_t (*bank_workspace)(const Tracks&, int m);
+  std::size_t (*block_size)(const Tracks&);  // doubles
+  void (*bank_step)(const Tracks&, Rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
+                    double* workspace);
+  // Measures rows, and conditions them when `write`; z is (count, m), d2 and log_likelihood (count,).
+  int (*bank_measure)(const Tracks&, Rows, bool write, int m, const double* z, const Model& H, const Model& d,
+                      const Model& R, double* d2, double* log_likelihood, double* workspace);
+  void (*bank_moments)(const Tracks&, Rows, double* mean, double* cov, double* probs, double* workspace);
+  void (*bank_read)(const Tracks&, Rows, double* log_probs, double* means, double* covs, double* workspace);
+  void (*bank_write)(const Tracks&, Rows, const double* log_probs, const double* means, const double* covs);
+  void (*bank_copy)(const Tracks& from, Rows source, const Tracks& to, Rows target);
+};
+
+// Null where this build has no such unit.
+extern const Kernel* const kBaseline;
+extern const Kernel* const kAvx2;
+extern const Kernel* const kAvx512;
+
+}  // namespace saltus

@@ -1,0 +1,80 @@
+// P(modes) of the lanes of one block, linear while that is safe and in logs when it is not.
+#pragma once
+
+#include "step.hpp"
+
+namespace saltus::SALTUS_NS {
+
+inline constexpr double kLog2Pi = 1.8378770664093453;
+// Below e^-460 (1e-200) of the likeliest mode a law is carried in logs: nothing is lost to underflow, and no outlier,
+// however gross, flattens the modes. Above, one exponential per mode and step does.
+inline constexpr double kLinearFloor = -460.0;
+
+// Turn a law in logs into a linear one where every lane allows it; returns whether it is still in logs.
+inline bool still_in_logs(V* law, int modes) {
+  I low{};
+  for (int j = 0; j < modes; ++j) low |= (law[j] < kLinearFloor) & (law[j] > -__builtin_inf());
+  if (any(low)) return true;
+  for (int j = 0; j < modes; ++j) law[j] = exponential(law[j]);
+  return false;
+}
+
+inline void into_logs(V* law, int modes) {
+  for (int j = 0; j < modes; ++j) law[j] = logarithm(law[j]);
+}
+
+// Bayes' rule with every number of a moderate size; false, and nothing changed, when some lane needs logs.
+inline bool reweigh_linear(V* law, int modes, int size, const V* report, V seen, V* heap, V& evidence) {
+  V least = splat(__builtin_inf());
+  for (int j = 0; j < modes; ++j) least = minimum(select(law[j] > 0.0, report[j * size], least), least);
+  V sum{};
+  for (int j = 0; j < modes; ++j) {
+    const V* r = report + j * size;
+    heap[j] = law[j] * square_root(r[1]) * exponential(minimum(-0.5 * (r[0] - least), V{}));
+    sum += heap[j];
+  }
+  const V floor = sum * 1e-200;
+  I weak = ~((sum > 1e-250) & (sum < 1e250));
+  for (int j = 0; j < modes; ++j) weak |= (heap[j] < floor) & (law[j] > 0.0);
+  if (any(weak)) return false;
+  const V scale = 1.0 / sum;
+  for (int j = 0; j < modes; ++j) {  // a division, rounded as one: the only mode there is has probability 1
+    const V quotient = heap[j] * scale;
+    law[j] = quotient + (heap[j] - quotient * sum) * scale;
+  }
+  evidence = logarithm(sum) - 0.5 * (least + seen * kLog2Pi);
+  return true;
+}
+
+inline V reweigh_logs(V* law, int modes, int m, const V* report, V seen) {
+  V top = splat(-__builtin_inf());
+  for (int j = 0; j < modes; ++j, report += report_size(m)) {
+    V log_det{};
+    for (int a = 0; a < m; ++a) log_det += logarithm(report[2 + a]);
+    law[j] -= 0.5 * (report[0] + log_det);
+    top = maximum(top, law[j]);
+  }
+  top = select(top > -1e300, top, V{});
+  V sum{};
+  for (int j = 0; j < modes; ++j) sum += exponential(law[j] - top);
+  const V total = logarithm(sum) + top;
+  for (int j = 0; j < modes; ++j) law[j] -= total;
+  return total - 0.5 * seen * kLog2Pi;
+}
+
+// law <- P(modes | z), returns log f(z): 0 where nothing was seen. `heap` holds one number per mode.
+inline V reweigh(V* law, bool& logs, int modes, int m, const V* report, V seen, V* heap) {
+  V evidence;
+  if (logs || !reweigh_linear(law, modes, report_size(m), report, seen, heap, evidence)) {
+    if (!logs) into_logs(law, modes);
+    logs = true;
+    evidence = reweigh_logs(law, modes, m, report, seen);
+  }
+  return select(seen > 0.0, evidence, V{});
+}
+
+inline void probabilities(const V* law, bool logs, int modes, V* probs) {
+  for (int j = 0; j < modes; ++j) probs[j] = logs ? exponential(law[j]) : law[j];
+}
+
+}  // namespace saltus::SALTUS_NS

@@ -1,0 +1,81 @@
+// Between rows in memory and lanes in registers, through W x W transposes.
+#pragma once
+
+#include "kernel.hpp"
+#include "lanes.hpp"
+
+namespace saltus::SALTUS_NS {
+
+using Size = std::ptrdiff_t;
+
+// Hands out pieces of a workspace; without memory it only counts them.
+struct Arena {
+  V* base = nullptr;
+  std::size_t used = 0;
+  V* take(std::size_t count) {
+    V* piece = base ? base + used : nullptr;
+    used += count;
+    return piece;
+  }
+  int* take_ints(std::size_t count) { return reinterpret_cast<int*>(take((count * sizeof(int)) / sizeof(V) + 1)); }
+};
+
+// out[i] lane l = rows[l][i], i < count.
+inline void load_lanes(const double* const (&rows)[W], int count, V* out) {
+  int i = 0;
+  for (; i + W <= count; i += W) {
+    V r[W];
+#pragma GCC unroll 8
+    for (int l = 0; l < W; ++l) r[l] = load(rows[l] + i);
+    transpose(r);
+#pragma GCC unroll 8
+    for (int l = 0; l < W; ++l) out[i + l] = r[l];
+  }
+  for (; i < count; ++i)
+    for (int l = 0; l < W; ++l) out[i][l] = rows[l][i];
+}
+
+// out[l * stride + i] = in[index[i]] lane l, i < count, l < lanes.
+inline void store_lanes(const V* in, const int* index, int count, double* out, Size stride, int lanes) {
+  int i = 0;
+  for (; i + W <= count; i += W) {
+    V r[W];
+#pragma GCC unroll 8
+    for (int l = 0; l < W; ++l) r[l] = in[index[i + l]];
+    transpose(r);
+#pragma GCC unroll 8
+    for (int l = 0; l < W; ++l)
+      if (l < lanes) store(out + l * stride + i, r[l]);
+  }
+  for (; i < count; ++i)
+    for (int l = 0; l < lanes; ++l) out[l * stride + i] = in[index[i]][l];
+}
+
+inline const double* address(const Model& model, Size track, Size step) {
+  return model.data + (model.rows ? model.rows[track] : track) * model.row + step * model.time;
+}
+
+// The rows of `model` for the tracks from `first` on, one per lane; the last track fills the lanes beyond it.
+inline void load_model(const Model& model, Size first, Size n_tracks, Size step, V* out) {
+  if (!model.data) return;
+  const int count = model.distinct * model.core;
+  if (!model.row) {
+    const double* row = address(model, 0, step);
+    for (int i = 0; i < count; ++i) out[i] = row[i] - V{};
+    return;
+  }
+  const double* rows[W];
+  for (int l = 0; l < W; ++l) rows[l] = address(model, first + l < n_tracks ? first + l : n_tracks - 1, step);
+  load_lanes(rows, count, out);
+}
+
+inline std::size_t lanes_of(const Model& model) { return model.data ? model.distinct * model.core : 0; }
+
+// Where element i of a full symmetric matrix lies in a packed one, for `index` of store_lanes.
+inline void symmetric_index(int n, int base, int* index) {
+  for (int i = 0; i < n; ++i)
+    for (int j = 0; j < n; ++j)
+      index[i * n + j] = base + (i >= j ? i * (i + 1) / 2 + j : j * (j + 1) / 2 + i);
+}
+
+}  // namespace saltus::SALTUS_NS

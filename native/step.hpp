@@ -1,0 +1,400 @@
+// The one recursion, step by step, on the lanes of one block: twins of src/saltus/filters/steps.py.
+//
+// A block holds, per mode, a record [x (n) | P packed by rows of its lower triangle (n (n + 1) / 2)]. N and M are the
+// sizes when known to the compiler, 0 when they are known at run time only. E is the element of a model matrix:
+// double, common to all lanes, or V, one per lane. Nothing here calls the host: the same text compiles for any scalar.
+#pragma once
+
+#include "lanes.hpp"
+
+namespace saltus::SALTUS_NS {
+
+#ifndef SALTUS_UNROLL
+#define SALTUS_UNROLL 6
+#endif
+
+// Keeps the moments of a mode of probability zero defined, and touches nothing else.
+inline constexpr double kFloor = 1e-290;
+
+// f(0), ..., f(n - 1), unrolled when N is small.
+template <int N, class F>
+SALTUS_INLINE void each(int n, F f) {
+  if constexpr (N > 0 && N <= SALTUS_UNROLL) {
+#pragma GCC unroll 8
+    for (int i = 0; i < N; ++i) f(i);
+  } else {
+    const int end = N > 0 ? N : n;
+#pragma GCC unroll 1
+    for (int i = 0; i < end; ++i) f(i);
+  }
+}
+
+// f(0), ..., f(i): a constant trip count with a condition, which the compiler can unroll before it knows i.
+template <int N, class F>
+SALTUS_INLINE void upto(int i, F f) {
+  if constexpr (N > 0 && N <= SALTUS_UNROLL) {
+#pragma GCC unroll 8
+    for (int j = 0; j < N; ++j)
+      if (j <= i) f(j);
+  } else {
+#pragma GCC unroll 1
+    for (int j = 0; j <= i; ++j) f(j);
+  }
+}
+
+// f(i), ..., f(n - 1).
+template <int N, class F>
+SALTUS_INLINE void from(int i, int n, F f) {
+  if constexpr (N > 0 && N <= SALTUS_UNROLL) {
+#pragma GCC unroll 8
+    for (int j = 0; j < N; ++j)
+      if (j >= i) f(j);
+  } else {
+    const int end = N > 0 ? N : n;
+#pragma GCC unroll 1
+    for (int j = i; j < end; ++j) f(j);
+  }
+}
+
+// Registers when the size is known (L > 0), a piece of `heap` otherwise.
+template <int L>
+struct Local {
+  V a[L];
+  SALTUS_INLINE Local(V*&, int) {}
+  SALTUS_INLINE V& operator[](int i) { return a[i]; }
+};
+template <>
+struct Local<0> {
+  V* a;
+  SALTUS_INLINE Local(V*& heap, int size) : a(heap) { heap += size; }
+  SALTUS_INLINE V& operator[](int i) { return a[i]; }
+};
+
+SALTUS_INLINE constexpr int triangle(int n) { return n * (n + 1) / 2; }
+SALTUS_INLINE constexpr int packed(int i, int j) { return i >= j ? triangle(i) + j : triangle(j) + i; }
+
+// A model matrix by mode: mode j has its elements at data + which[j] * core.
+template <class E>
+struct ByMode {
+  const E* data;
+  const int* which;
+  int core;
+  SALTUS_INLINE const E* operator[](int mode) const { return data + which[mode] * core; }
+  SALTUS_INLINE bool present() const { return data != nullptr; }
+};
+
+// Weights mu[i * size + j] = trans_ij P_i / Q_j of one fibre of modes, and its law advanced to Q in place.
+template <class E>
+SALTUS_INLINE void mixing_weights(V* law, int stride, int size, const E* trans, bool logs, V* mu) {
+  V top{};
+  if (logs) {
+    top = law[0];
+    for (int i = 1; i < size; ++i) top = maximum(top, law[i * stride]);
+    top = select(top > -1e300, top, V{});
+  }
+  V* p = mu + size * size;
+  for (int i = 0; i < size; ++i) p[i] = logs ? exponential(law[i * stride] - top) : law[i * stride];
+  for (int j = 0; j < size; ++j) {
+    V q{}, total{};
+    for (int i = 0; i < size; ++i) {
+      V joint = p[i] * trans[i * size + j];
+      q += joint;
+      mu[i * size + j] = joint + kFloor;
+      total += joint + kFloor;
+    }
+    V inverse = 1.0 / total;
+    for (int i = 0; i < size; ++i) mu[i * size + j] *= inverse;
+    law[j * stride] = logs ? logarithm(q) + top : q;
+  }
+}
+
+// Moment matching of two modes, in place: R_j = mu_0j P_0 + mu_1j P_1 + mu_0j mu_1j (x_0 - x_1)(x_0 - x_1)'.
+template <int N>
+SALTUS_INLINE void mix_pair(V* a, V* b, const V* mu, int n, V* heap) {
+  const V a0 = mu[0], a1 = mu[1], b0 = mu[2], b1 = mu[3], c0 = a0 * b0, c1 = a1 * b1;
+  Local<N> gap(heap, n);
+  each<N>(n, [&](int i) SALTUS_LAMBDA {
+    const V x = a[i], y = b[i];
+    gap[i] = x - y;
+    a[i] = a0 * x + b0 * y;
+    b[i] = a1 * x + b1 * y;
+  });
+  each<N>(n, [&](int i) SALTUS_LAMBDA {
+    upto<N>(i, [&](int j) SALTUS_LAMBDA {
+      const int k = n + packed(i, j);
+      const V P = a[k], R = b[k], spread = gap[i] * gap[j];
+      a[k] = a0 * P + (b0 * R + c0 * spread);
+      b[k] = a1 * P + (b1 * R + c1 * spread);
+    });
+  });
+}
+
+// Moment matching of one fibre of any size: R_j = sum_i mu_ij [P_i + (x_i - x_j)(x_i - x_j)'].
+template <int N>
+SALTUS_INLINE void mix_fibre(V* first, long stride, int size, const V* mu, int n, V* heap) {
+  const int record = n + triangle(n);
+  V* old = heap;
+  heap += size * record;
+  for (int i = 0; i < size; ++i)
+    for (int k = 0; k < record; ++k) old[i * record + k] = first[i * stride + k];
+  for (int j = 0; j < size; ++j) {
+    V* free = heap;
+    Local<N> x(free, n), gap(free, n);
+    Local<triangle(N)> P(free, triangle(n));
+    each<N>(n, [&](int k) SALTUS_LAMBDA { x[k] = V{}; });
+    each<N>(n, [&](int k) SALTUS_LAMBDA { upto<N>(k, [&](int l) SALTUS_LAMBDA { P[packed(k, l)] = V{}; }); });
+    for (int i = 0; i < size; ++i)
+      each<N>(n, [&](int k) SALTUS_LAMBDA { x[k] += mu[i * size + j] * old[i * record + k]; });
+    for (int i = 0; i < size; ++i) {
+      const V weight = mu[i * size + j];
+      const V* source = old + i * record;
+      each<N>(n, [&](int k) SALTUS_LAMBDA { gap[k] = source[k] - x[k]; });
+      each<N>(n, [&](int k) SALTUS_LAMBDA {
+        const V scaled = weight * gap[k];
+        upto<N>(k, [&](int l) SALTUS_LAMBDA {
+          P[packed(k, l)] += weight * source[n + packed(k, l)] + scaled * gap[l];
+        });
+      });
+    }
+    V* target = first + j * stride;
+    each<N>(n, [&](int k) SALTUS_LAMBDA { target[k] = x[k]; });
+    each<N>(n, [&](int k) SALTUS_LAMBDA {
+      upto<N>(k, [&](int l) SALTUS_LAMBDA { target[n + packed(k, l)] = P[packed(k, l)]; });
+    });
+  }
+}
+
+// One chain: modes are outer x size x inner, the middle axis is mixed. `law` is P(modes), or its logarithm.
+template <int N, class E>
+void mix(V* state, V* law, int size_n, int outer, int size, int inner, const E* trans, bool logs, V* heap) {
+  const int n = N > 0 ? N : size_n;
+  const long record = n + triangle(n);
+  V* mu = heap;
+  heap += size * size + size;
+  for (int o = 0; o < outer; ++o)
+    for (int i = 0; i < inner; ++i) {
+      const int at = o * size * inner + i;
+      mixing_weights(law + at, inner, size, trans, logs, mu);
+      if (size == 2)
+        mix_pair<N>(state + at * record, state + (at + inner) * record, mu, n, heap);
+      else
+        mix_fibre<N>(state + at * record, inner * record, size, mu, n, heap);
+    }
+}
+
+// x <- F x + b, P <- F P F' + Q for every mode.
+template <int N, class E>
+void propagate(V* state, int size_n, int modes, ByMode<E> F, ByMode<E> b, ByMode<E> Q, V* heap) {
+  const int n = N > 0 ? N : size_n;
+  const int record = n + triangle(n);
+  for (int mode = 0; mode < modes; ++mode, state += record) {
+    V* free = heap;
+    const E *f = F[mode], *q = Q[mode];
+    Local<triangle(N)> P(free, triangle(n));
+    Local<N> x(free, n), row(free, n);
+    each<N>(n, [&](int i) SALTUS_LAMBDA {
+      x[i] = state[i];
+      upto<N>(i, [&](int j) SALTUS_LAMBDA { P[packed(i, j)] = state[n + packed(i, j)]; });
+    });
+    each<N>(n, [&](int i) SALTUS_LAMBDA {
+      V moved = b.present() ? splat(b[mode][i]) : V{};
+      each<N>(n, [&](int k) SALTUS_LAMBDA { moved += x[k] * f[i * n + k]; });
+      state[i] = moved;
+      each<N>(n, [&](int c) SALTUS_LAMBDA { row[c] = P[packed(0, c)] * f[i * n]; });
+      from<N>(1, n, [&](int k) SALTUS_LAMBDA {
+        each<N>(n, [&](int c) SALTUS_LAMBDA { row[c] += P[packed(k, c)] * f[i * n + k]; });
+      });
+      upto<N>(i, [&](int j) SALTUS_LAMBDA {
+        V sum = splat(q[i * n + j]);
+        each<N>(n, [&](int c) SALTUS_LAMBDA { sum += row[c] * f[j * n + c]; });
+        state[n + packed(i, j)] = sum;
+      });
+    });
+  }
+}
+
+// sum_j P_j x_j and sum_j P_j [P_j + (x_j - mean)(x_j - mean)'] into out = [mean | packed covariance].
+template <int N>
+void collapse(const V* state, const V* probs, int size_n, int modes, V* out, V* heap) {
+  const int n = N > 0 ? N : size_n;
+  const int record = n + triangle(n);
+  Local<N> x(heap, n), gap(heap, n);
+  Local<triangle(N)> P(heap, triangle(n));
+  each<N>(n, [&](int i) SALTUS_LAMBDA {
+    x[i] = V{};
+    upto<N>(i, [&](int j) SALTUS_LAMBDA { P[packed(i, j)] = V{}; });
+  });
+  for (int mode = 0; mode < modes; ++mode)
+    each<N>(n, [&](int i) SALTUS_LAMBDA { x[i] += probs[mode] * state[mode * record + i]; });
+  for (int mode = 0; mode < modes; ++mode) {
+    const V* source = state + mode * record;
+    const V weight = probs[mode];
+    each<N>(n, [&](int i) SALTUS_LAMBDA { gap[i] = source[i] - x[i]; });
+    each<N>(n, [&](int i) SALTUS_LAMBDA {
+      const V scaled = weight * gap[i];
+      upto<N>(i, [&](int j) SALTUS_LAMBDA {
+        P[packed(i, j)] += weight * source[n + packed(i, j)] + scaled * gap[j];
+      });
+    });
+  }
+  each<N>(n, [&](int i) SALTUS_LAMBDA {
+    out[i] = x[i];
+    upto<N>(i, [&](int j) SALTUS_LAMBDA { out[n + packed(i, j)] = P[packed(i, j)]; });
+  });
+}
+
+// What a measurement says of one mode, per mode in `report`: [d2 | 1 / det S | pivots (m) | nu (m) | S packed].
+SALTUS_INLINE constexpr int report_size(int m) { return 2 + 2 * m + triangle(m); }
+
+// Measure and condition every mode (`Gain`), or measure only, in Joseph form.
+//
+//   nu = z - H x - d,  U = P H',  S = H U + R = L D L',  K = U S^-1,  T = P - K U' = (I - K H) P,
+//   P+ = T (I - K H)' + K R K' = T - (T H' - K R) K'.
+//
+// The last form costs n^2 m where the product with I - K H costs n^3, and keeps what makes Joseph's form safe: an
+// error in T is multiplied by (I - K H)', which annihilates it in the measured directions. A component not seen
+// (on = 0) has its row of nu, of L and of D^-1 zero, hence its column of K: no branch. Returns the lanes in which an S
+// was not positive definite.
+template <int N, int M, class E, bool Gain>
+I measure(V* state, int size_n, int size_m, int modes, ByMode<E> H, ByMode<E> d, ByMode<E> R, const V* z, const V* on,
+          V* report, V* heap) {
+  const int n = N > 0 ? N : size_n, m = M > 0 ? M : size_m;
+  const int record = n + triangle(n);
+  constexpr int NM = N * M;
+  I bad{};
+  for (int mode = 0; mode < modes; ++mode, state += record, report += report_size(m)) {
+    V* free = heap;
+    const E *h = H[mode], *r = R[mode];
+    V *x = state, *P = state + n;
+    Local<NM> U(free, n * m);
+    Local<triangle(M)> L(free, triangle(m));
+    Local<M> nu(free, m), inverse(free, m);
+    each<N>(n, [&](int i) SALTUS_LAMBDA {
+      each<M>(m, [&](int a) SALTUS_LAMBDA {
+        V sum = P[packed(i, 0)] * h[a * n];
+        from<N>(1, n, [&](int k) SALTUS_LAMBDA { sum += P[packed(i, k)] * h[a * n + k]; });
+        U[i * m + a] = sum;
+      });
+    });
+    V* S = report + 2 + 2 * m;
+    each<M>(m, [&](int a) SALTUS_LAMBDA {
+      V residual = z[a];
+      if (d.present()) residual -= d[mode][a];
+      each<N>(n, [&](int k) SALTUS_LAMBDA { residual -= x[k] * h[a * n + k]; });
+      nu[a] = residual * on[a];
+      report[2 + m + a] = nu[a];
+      upto<M>(a, [&](int b) SALTUS_LAMBDA {
+        V sum = splat(r[a * m + b]);
+        each<N>(n, [&](int k) SALTUS_LAMBDA { sum += U[k * m + b] * h[a * n + k]; });
+        sum = a == b ? select(on[a] != 0.0, sum, splat(1.0)) : sum * (on[a] * on[b]);
+        L[packed(a, b)] = sum;
+        S[packed(a, b)] = sum;
+      });
+    });
+    // S = L D L' in place: `inverse` is D^-1, 0 where not seen; nu becomes L^-1 nu.
+    V d2{}, inverse_det = splat(1.0);
+    each<M>(m, [&](int a) SALTUS_LAMBDA {
+      const V pivot = L[packed(a, a)];
+      bad |= ~(pivot > 0.0);
+      report[2 + a] = pivot;
+      const V reciprocal = 1.0 / pivot;
+      inverse_det *= reciprocal;
+      inverse[a] = reciprocal * on[a];
+      from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA {
+        const V factor = L[packed(b, a)] * reciprocal;
+        nu[b] -= factor * nu[a];
+        from<M>(a + 1, m, [&](int c) SALTUS_LAMBDA {
+          if (c <= b) L[packed(b, c)] -= factor * L[packed(c, a)];
+        });
+      });
+      from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA { L[packed(b, a)] *= reciprocal; });
+      d2 += nu[a] * nu[a] * inverse[a];
+    });
+    report[0] = d2;
+    report[1] = inverse_det;
+    if constexpr (Gain) {
+      Local<NM> K(free, n * m);
+      Local<N> T(free, n);
+      Local<M> w(free, m);
+      each<N>(n, [&](int i) SALTUS_LAMBDA {
+        each<M>(m, [&](int a) SALTUS_LAMBDA {
+          V g = U[i * m + a];
+          upto<M>(a - 1, [&](int b) SALTUS_LAMBDA { g -= L[packed(a, b)] * w[b]; });
+          w[a] = g;
+        });
+        V moved = x[i];
+        each<M>(m, [&](int a) SALTUS_LAMBDA {
+          w[a] *= inverse[a];
+          moved += w[a] * nu[a];
+        });
+        x[i] = moved;
+        each<M>(m, [&](int back) SALTUS_LAMBDA {
+          const int a = m - 1 - back;
+          V g = w[a];
+          from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA { g -= L[packed(b, a)] * K[i * m + b]; });
+          K[i * m + a] = g;
+        });
+      });
+      // In place: row i writes P[i][j <= i] only, which no later row reads.
+      each<N>(n, [&](int i) SALTUS_LAMBDA {
+        each<N>(n, [&](int j) SALTUS_LAMBDA {
+          V t = P[packed(i, j)];
+          each<M>(m, [&](int a) SALTUS_LAMBDA { t -= K[i * m + a] * U[j * m + a]; });
+          T[j] = t;
+        });
+        each<M>(m, [&](int a) SALTUS_LAMBDA {
+          V g = T[0] * h[a * n];
+          from<N>(1, n, [&](int k) SALTUS_LAMBDA { g += T[k] * h[a * n + k]; });
+          each<M>(m, [&](int b) SALTUS_LAMBDA { g -= K[i * m + b] * r[a * m + b]; });
+          w[a] = g;
+        });
+        upto<N>(i, [&](int j) SALTUS_LAMBDA {
+          V t = T[j];
+          each<M>(m, [&](int a) SALTUS_LAMBDA { t -= w[a] * K[j * m + a]; });
+          P[packed(i, j)] = t;
+        });
+      });
+    }
+  }
+  return bad;
+}
+
+// Squared Mahalanobis distance of the mixture's innovation: nu and S of every mode, weighted by the predicted `probs`.
+template <int M>
+V mixture_nis(const V* report, const V* probs, int size_m, int modes, V* heap) {
+  const int m = M > 0 ? M : size_m;
+  const V* first = report + 2 + m;
+  const int size = report_size(m);
+  Local<M> mean(heap, m), gap(heap, m);
+  Local<triangle(M)> S(heap, triangle(m));
+  each<M>(m, [&](int a) SALTUS_LAMBDA {
+    mean[a] = V{};
+    upto<M>(a, [&](int b) SALTUS_LAMBDA { S[packed(a, b)] = V{}; });
+  });
+  for (int mode = 0; mode < modes; ++mode)
+    each<M>(m, [&](int a) SALTUS_LAMBDA { mean[a] += probs[mode] * first[mode * size + a]; });
+  for (int mode = 0; mode < modes; ++mode) {
+    const V* nu = first + mode * size;
+    const V weight = probs[mode];
+    each<M>(m, [&](int a) SALTUS_LAMBDA { gap[a] = nu[a] - mean[a]; });
+    each<M>(m, [&](int a) SALTUS_LAMBDA {
+      const V scaled = weight * gap[a];
+      upto<M>(a, [&](int b) SALTUS_LAMBDA { S[packed(a, b)] += weight * nu[m + packed(a, b)] + scaled * gap[b]; });
+    });
+  }
+  V d2{};
+  each<M>(m, [&](int a) SALTUS_LAMBDA {
+    const V reciprocal = 1.0 / S[packed(a, a)];
+    d2 += mean[a] * mean[a] * reciprocal;
+    from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA {
+      const V factor = S[packed(b, a)] * reciprocal;
+      mean[b] -= factor * mean[a];
+      from<M>(a + 1, m, [&](int c) SALTUS_LAMBDA {
+        if (c <= b) S[packed(b, c)] -= factor * S[packed(c, a)];
+      });
+    });
+  });
+  return d2;
+}
+
+}  // namespace saltus::SALTUS_NS

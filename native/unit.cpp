@@ -1,0 +1,61 @@
+// The kernel of one instruction set: SALTUS_NS names it, SALTUS_KERNEL is where the dispatcher finds it.
+#include "bank.hpp"
+#include "recursion.hpp"
+
+#define SALTUS_STRING(x) #x
+#define SALTUS_NAME(x) SALTUS_STRING(x)
+
+namespace saltus::SALTUS_NS {
+namespace {
+
+Arena arena(double* workspace) { return {reinterpret_cast<V*>(workspace), 0}; }
+
+std::size_t filter_workspace(const Problem& p) { return Recursion(p, {}).used() * W; }
+
+int filter(const Problem& p, Size first_block, Size last_block, double* workspace) {
+  return Recursion(p, arena(workspace)).run(first_block, last_block);
+}
+
+std::size_t bank_workspace(const Tracks& t, int m) {
+  V *copy, *law, *heap;
+  std::size_t models = 0;
+  const std::size_t n = t.n;
+  for (int c = 0; c < t.chains; ++c) models += std::size_t(t.sizes[c]) * t.sizes[c];
+  models += std::size_t(t.modes) * (2 * n * n + n + m * n + m + std::size_t(m) * m);
+  models += std::size_t(t.modes) * (report_size(m) + 1) + 2 * m + record_of(t) + n * n + 64;
+  return (bank_space(t, m, {}, &copy, &law, &heap) + models) * W;
+}
+
+std::size_t block_size(const Tracks& t) { return block_of(t) * W; }
+
+void bank_step(const Tracks& t, Rows rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
+               double* workspace) {
+  step_rows(t, rows, trans, F, b, Q, arena(workspace));
+}
+
+int bank_measure(const Tracks& t, Rows rows, bool write, int m, const double* z, const Model& H, const Model& d,
+                 const Model& R, double* d2, double* log_likelihood, double* workspace) {
+  return measure_rows(t, rows, write, m, z, H, d, R, d2, log_likelihood, arena(workspace));
+}
+
+void bank_moments(const Tracks& t, Rows rows, double* mean, double* cov, double* probs, double* workspace) {
+  moments_of_rows(t, rows, mean, cov, probs, arena(workspace));
+}
+
+void bank_read(const Tracks& t, Rows rows, double* log_probs, double* means, double* covs, double* workspace) {
+  read_rows(t, rows, log_probs, means, covs, arena(workspace));
+}
+
+void bank_write(const Tracks& t, Rows rows, const double* log_probs, const double* means, const double* covs) {
+  write_rows(t, rows, log_probs, means, covs);
+}
+
+const Kernel kernel{SALTUS_NAME(SALTUS_NS), W,          filter_workspace, filter,    bank_workspace, block_size,
+                    bank_step,              bank_measure, bank_moments,     bank_read, bank_write,     copy_rows};
+
+}  // namespace
+}  // namespace saltus::SALTUS_NS
+
+namespace saltus {
+const Kernel* const SALTUS_KERNEL = &SALTUS_NS::kernel;
+}

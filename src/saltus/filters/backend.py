@@ -1,0 +1,105 @@
+"""The choice between the definition in NumPy and its compiled twin, and what this machine offers."""
+
+import logging
+import os
+from functools import cache
+from types import ModuleType
+from typing import Literal
+
+from saltus.errors import ModelError
+
+__all__ = ["Backend", "instruction_set", "native_module", "system_report", "thread_count", "use_native"]
+
+Backend = Literal["numpy", "native"]
+
+_THREAD_WORK = 2e7  # multiply-adds below which starting a thread costs more than it saves
+
+
+@cache
+def native_module() -> ModuleType | None:
+    """Return the compiled kernel, or None where it was not built (said once in the log)."""
+    try:
+        from saltus import _native
+    except ImportError as error:
+        if os.environ.get("SALTUS_REQUIRE_NATIVE") == "1":
+            raise ImportError(
+                "SALTUS_REQUIRE_NATIVE=1, but saltus was installed without its compiled kernel "
+                f"({error}). Install a C++20 compiler and reinstall saltus."
+            ) from error
+        logging.getLogger("saltus").info("the compiled kernel is absent (%s): filters run in NumPy", error)
+        return None
+    return _native
+
+
+def use_native(backend: Backend | None) -> bool:
+    """Say whether `backend` (None chooses) means the compiled kernel.
+
+    Raises:
+        ModelError: an unknown backend, or "native" where there is none.
+    """
+    if backend not in (None, "numpy", "native"):
+        raise ModelError(f'backend is None, "numpy" or "native", not {backend!r}.')
+    if backend == "numpy":
+        return False
+    if native_module() is not None:
+        return True
+    if backend == "native":
+        raise ModelError(
+            'backend="native", but saltus was installed without its compiled kernel: there was no C++20 compiler. '
+            'Install one and reinstall saltus, or use backend="numpy".'
+        )
+    return False
+
+
+def instruction_set() -> str:
+    """Return the instruction set in use: the widest this machine has, or the one that SALTUS_ISA names.
+
+    Raises:
+        ModelError: SALTUS_ISA names one that this machine or this build does not have.
+    """
+    native = native_module()
+    names: list[str] = [] if native is None else _instruction_sets()
+    wanted = os.environ.get("SALTUS_ISA", "")
+    if wanted and wanted not in names:
+        raise ModelError(f"SALTUS_ISA={wanted} is not available here; there is: {', '.join(names) or 'none'}.")
+    return wanted or (names[0] if names else "")
+
+
+@cache
+def _instruction_sets() -> list[str]:
+    native = native_module()
+    return [] if native is None else list(native.instruction_sets())
+
+
+def thread_count(num_threads: int | None, work: float) -> int:
+    """Return the number of threads: as asked, else the cores this process may use when `work` is worth it.
+
+    Args:
+        num_threads: what the caller asked for.
+        work: multiply-adds to do.
+
+    Raises:
+        ModelError: num_threads is not at least 1.
+    """
+    if num_threads is not None:
+        if num_threads < 1:
+            raise ModelError(f"num_threads is at least 1, not {num_threads}.")
+        return int(num_threads)
+    if work < _THREAD_WORK:
+        return 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def system_report() -> dict[str, str]:
+    """Describe the backend in use, for people: kernel, instruction set, lanes, threads."""
+    native = native_module()
+    threads = str(thread_count(None, float("inf")))
+    if native is None:
+        return {"kernel": "absent: filters run in NumPy", "threads": threads}
+    isa = instruction_set()
+    return {
+        "kernel": "compiled",
+        "instruction set": f"{isa} ({native.lanes(isa)} tracks per register)",
+        "instruction sets of this machine": ", ".join(_instruction_sets()),
+        "threads": threads,
+    }

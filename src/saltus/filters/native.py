@@ -1,0 +1,158 @@
+"""The compiled twins: the batch recursion and the store of a Bank, on the arrays of their definitions."""
+
+from collections.abc import Sequence
+from math import prod
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.errors import DataError, ModelError, NumericalError
+from saltus.filters.align import Aligned
+from saltus.filters.backend import instruction_set, native_module, thread_count
+from saltus.filters.estimates import Estimates
+from saltus.filters.steps import NOT_POSITIVE, Belief
+
+__all__ = ["NativeStore", "filter_native"]
+
+_Array = npt.NDArray[np.float64]
+_Rows = npt.NDArray[np.intp]
+
+_NOT_POSITIVE, _INFINITE = 1, 2  # bits of the kernel's status
+_WRITTEN = ("probs", "mean", "cov", "log_likelihood", "nis", "n_observed", "mode_means", "mode_covs")
+
+
+def filter_native(z: _Array, model: Aligned, *, per_mode: bool, every: bool, num_threads: int | None) -> Estimates:
+    """Run the compiled recursion over aligned arrays.
+
+    Args:
+        z: the measurements with their NaN, (*batch, T, m).
+        model: the other arguments, aligned.
+        per_mode: also return every mode's mean and covariance.
+        every: keep all rows, not the last only.
+        num_threads: threads to use; None chooses.
+    """
+    native = native_module()
+    if native is None:
+        raise ModelError("there is no compiled kernel here.")
+    batch, (n_steps, m) = z.shape[:-2], z.shape[-2:]
+    sizes, n, runs = model.sizes, model.cov0.shape[-1], prod(z.shape[:-2])
+    out = _allocate(batch, n_steps if every else 1, n_steps, sizes, n, per_mode)
+    work = float(runs) * n_steps * prod(sizes) * n * n * (n + m)
+    if runs:
+        status = native.imm_filter(
+            instruction_set(),
+            np.ascontiguousarray(z.reshape((runs, n_steps, m))),
+            _described(model, batch),
+            {name: getattr(out, name) for name in _WRITTEN},
+            every,
+            thread_count(num_threads, work),
+        )
+        if status & _INFINITE:
+            raise DataError("z holds an infinite number. A missing component is NaN.")
+        if status & _NOT_POSITIVE:
+            raise NumericalError(NOT_POSITIVE)
+    return out
+
+
+def _allocate(
+    batch: tuple[int, ...], kept: int, n_steps: int, sizes: tuple[int, ...], n: int, per_mode: bool
+) -> Estimates:
+    rows = (*batch, kept)
+    return Estimates(
+        probs=np.empty((*rows, *sizes)),
+        mean=np.empty((*rows, n)),
+        cov=np.empty((*rows, n, n)),
+        log_likelihood=np.empty((*batch, n_steps)),
+        log_likelihood_start=np.zeros(batch),
+        nis=np.empty(rows),
+        n_observed=np.empty(rows),
+        mode_means=np.empty((*rows, *sizes, n)) if per_mode else None,
+        mode_covs=np.empty((*rows, *sizes, n, n)) if per_mode else None,
+    )
+
+
+def _described(model: Aligned, batch: tuple[int, ...]) -> dict[str, object]:
+    def runs(a: _Array | None) -> object:
+        return None if a is None else _by_run(a, batch)
+
+    return {
+        "n": model.cov0.shape[-1],
+        "sizes": list(model.sizes),
+        "F": runs(model.F),
+        "b": runs(model.b),
+        "Q": runs(model.Q),
+        "H": runs(model.H),
+        "d": runs(model.d),
+        "R": runs(model.R),
+        "mean0": runs(model.mean0),
+        "cov0": runs(model.cov0),
+        "log_probs0": runs(model.log_probs0),
+        "trans": [runs(t) for t in model.trans],
+    }
+
+
+def _by_run(a: _Array, batch: tuple[int, ...]) -> _Array | tuple[_Array, npt.NDArray[np.int64]]:
+    """One leading axis for all runs, of length 1 where all share it; with row numbers where only some axes do."""
+    given, rest = a.shape[: len(batch)], a.shape[len(batch) :]
+    flat = np.ascontiguousarray(a.reshape((prod(given), *rest)))
+    if given == batch or prod(given) == 1:
+        return flat
+    rows = np.broadcast_to(np.arange(prod(given), dtype=np.int64).reshape(given), batch)
+    return flat, rows.ravel()
+
+
+class NativeStore:
+    """The beliefs of a Bank in the lanes of the compiled kernel: the twin of `bank.NumpyStore`."""
+
+    def __init__(self, n: int, sizes: tuple[int, ...], capacity: int) -> None:
+        """Make room for `capacity` rows."""
+        native = native_module()
+        if native is None:
+            raise ModelError("there is no compiled kernel here.")
+        self._n, self._sizes = n, sizes
+        self._lanes = native.Bank(instruction_set(), n, list(sizes), capacity)
+
+    def grow(self, capacity: int) -> None:
+        """Make room for more rows."""
+        self._lanes.grow(capacity)
+
+    def read(self, rows: _Rows) -> Belief:
+        """Return copies of the rows' beliefs."""
+        lead = (len(rows), *self._sizes)
+        belief = Belief(np.empty(lead), np.empty((*lead, self._n)), np.empty((*lead, self._n, self._n)))
+        self._lanes.read(rows, *belief)
+        return belief
+
+    def write(self, rows: _Rows, belief: Belief) -> None:
+        """Overwrite rows."""
+        lead, n = (len(rows), *self._sizes), self._n
+        self._lanes.write(
+            rows,
+            np.ascontiguousarray(np.broadcast_to(belief.log_probs, lead)),
+            np.ascontiguousarray(np.broadcast_to(belief.means, (*lead, n))),
+            np.ascontiguousarray(np.broadcast_to(belief.covs, (*lead, n, n))),
+        )
+
+    def copy_from(self, rows: _Rows, other: "NativeStore", other_rows: _Rows) -> None:
+        """Overwrite rows with those of another store."""
+        self._lanes.copy_from(rows, other._lanes, other_rows)
+
+    def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None:
+        """Mix and propagate rows."""
+        self._lanes.step(rows, trans, F, b, Q)
+
+    def measure(
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, write: bool
+    ) -> tuple[_Array, _Array]:
+        """Return d2 and log f(z); condition the rows when `write`."""
+        d2, log_f = np.empty(len(rows)), np.empty(len(rows))
+        if self._lanes.measure(rows, write, z, H, d, R, d2, log_f) & _NOT_POSITIVE:
+            raise NumericalError(NOT_POSITIVE)
+        return d2, log_f
+
+    def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]:
+        """Return mean, covariance and mode probabilities of rows."""
+        k, n = len(rows), self._n
+        mean, cov, probs = np.empty((k, n)), np.empty((k, n, n)), np.empty((k, *self._sizes))
+        self._lanes.moments(rows, mean, cov, probs)
+        return mean, cov, probs
