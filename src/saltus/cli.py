@@ -83,9 +83,7 @@ def study(name: str, output: Path, runs: int | None, seed: int) -> None:
 
 
 @main.command()
-@click.option(
-    "-o", "--output", default="saltus-demo", show_default=True, type=_FILE, help="Output directory."
-)
+@click.option("-o", "--output", default="saltus-demo", show_default=True, type=_FILE, help="Output directory.")
 @click.option("--seed", type=int, default=0, show_default=True)
 def demo(output: Path, seed: int) -> None:
     """Simulate two radars (manoeuvres, clutter, missed detections), write ASTERIX, track the files."""

@@ -3,6 +3,7 @@
 from saltus.filters.bank import Bank
 from saltus.filters.estimates import Estimates
 from saltus.filters.imm import imm_filter
+from saltus.filters.run import IMM, Record
 from saltus.filters.steps import Belief
 
-__all__ = ["Bank", "Belief", "Estimates", "imm_filter"]
+__all__ = ["IMM", "Bank", "Belief", "Estimates", "Record", "imm_filter"]

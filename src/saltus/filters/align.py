@@ -15,6 +15,7 @@ from saltus.errors import DataError, ModelError
 __all__ = ["Aligned", "align"]
 
 _Array = npt.NDArray[np.float64]
+_LARGE = 100_000  # elements above which reading an array once more is worth avoiding
 _MAX_EIGEN_CHECKS = 4096  # matrices whose eigenvalues are looked at; beyond, the update's Cholesky tells
 
 
@@ -43,12 +44,12 @@ class Aligned(NamedTuple):
 class _Reader:
     """Reads arguments one by one against the shapes that z, trans and cov0 fix."""
 
-    def __init__(self, batch: tuple[int, ...], n_steps: int, sizes: tuple[int, ...]) -> None:
-        self.batch, self.n_steps, self.sizes = batch, n_steps, sizes
+    def __init__(self, batch: tuple[int, ...], n_steps: int, sizes: tuple[int, ...], defer: bool) -> None:
+        self.batch, self.n_steps, self.sizes, self.defer = batch, n_steps, sizes, defer
 
     def model(self, name: str, value: npt.ArrayLike, core: tuple[int, ...]) -> _Array:
         """Read a model array with trailing axes `core`: constant, time varying or per run."""
-        a = _finite(name, value)
+        a = np.asarray(value, dtype=np.float64) if self._deferred(value, core) else _finite(name, value)
         n_modes, base = len(self.sizes), len(self.sizes) + len(core)
         expected = f"(*{self.batch}, {self.n_steps}|1, {_modes(self.sizes)}{_axes(core)})"
         if a.ndim < base:
@@ -59,6 +60,15 @@ class _Reader:
             )
         full = (*self.batch, self.n_steps, *self.sizes, *core)
         return self._fit(name, a, full, expected, exact=len(core))
+
+    def covariance(self, name: str, value: npt.ArrayLike, core: tuple[int, ...]) -> _Array:
+        """Read a model array of covariances."""
+        a = self.model(name, value, core)
+        return a if self._deferred(value, core) else _covariance(name, a)
+
+    def _deferred(self, value: npt.ArrayLike, core: tuple[int, ...]) -> bool:
+        """Whether the elements are left to the compiled kernel: given per run, and too large to be read twice."""
+        return self.defer and np.ndim(value) > len(self.sizes) + 1 + len(core) and np.size(value) > _LARGE
 
     def prior(self, name: str, value: npt.ArrayLike, core: tuple[int, ...]) -> _Array:
         """Read mean0 or cov0: shared, per mode, or per run."""
@@ -110,8 +120,12 @@ def align(
     probs0: npt.ArrayLike,
     b: npt.ArrayLike | None,
     d: npt.ArrayLike | None,
+    defer: bool = False,
 ) -> Aligned:
     """Validate the arguments of a batch filter and give every array its full set of axes.
+
+    With `defer`, the elements of large model arrays given per run are not looked at: the compiled kernel reports
+    doubtful ones as it loads them, and its caller aligns again without `defer`.
 
     Raises:
         ModelError: a shape that fits no reading, probabilities that are none, a covariance that is none.
@@ -132,14 +146,14 @@ def align(
     for c, t in enumerate(matrices):
         if t.ndim < 2 or t.shape[-1] != t.shape[-2] or t.shape[-1] == 0:
             raise ModelError(f"trans[{c}] has shape {t.shape}; a transition matrix is square, (M, M).")
-    reader = _Reader(z_in.shape[:-2], z_in.shape[-2], tuple(t.shape[-1] for t in matrices))
+    reader = _Reader(z_in.shape[:-2], z_in.shape[-2], tuple(t.shape[-1] for t in matrices), defer)
     return Aligned(
         z=np.where(seen, z_in, 0.0),
         seen=seen,
         F=reader.model("F", F, (n, n)),
-        Q=_covariance("Q", reader.model("Q", Q, (n, n))),
+        Q=reader.covariance("Q", Q, (n, n)),
         H=reader.model("H", H, (m, n)),
-        R=_covariance("R", reader.model("R", R, (m, m))),
+        R=reader.covariance("R", R, (m, m)),
         b=None if b is None else reader.model("b", b, (n,)),
         d=None if d is None else reader.model("d", d, (m,)),
         trans=tuple(_transition(c, reader.plain(f"trans[{c}]", t, t.shape[-2:], True)) for c, t in enumerate(matrices)),

@@ -75,13 +75,16 @@ def imm_filter(
     if keep not in ("all", "last"):
         raise ModelError(f'keep is "all" or "last", not {keep!r}.')
     native = use_native(backend)
-    model = align(z, F=F, Q=Q, H=H, R=R, trans=trans, mean0=mean0, cov0=cov0, probs0=probs0, b=b, d=d)
+
+    def aligned(defer: bool) -> Aligned:
+        return align(z, F=F, Q=Q, H=H, R=R, trans=trans, mean0=mean0, cov0=cov0, probs0=probs0, b=b, d=d, defer=defer)
+
     if native:
         from saltus.filters.native import filter_native
 
         measured = np.asarray(z, dtype=np.float64)
-        return filter_native(measured, model, per_mode=per_mode, every=keep == "all", num_threads=num_threads)
-    return _filter(model, per_mode=per_mode, every=keep == "all")
+        return filter_native(measured, aligned, per_mode=per_mode, every=keep == "all", num_threads=num_threads)
+    return _filter(aligned(False), per_mode=per_mode, every=keep == "all")
 
 
 def _filter(model: Aligned, *, per_mode: bool, every: bool) -> Estimates:

@@ -1,12 +1,12 @@
 """The compiled twins: the batch recursion and the store of a Bank, on the arrays of their definitions."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import prod
 
 import numpy as np
 import numpy.typing as npt
 
-from saltus.errors import DataError, ModelError, NumericalError
+from saltus.errors import ModelError, NumericalError
 from saltus.filters.align import Aligned
 from saltus.filters.backend import instruction_set, native_module, thread_count
 from saltus.filters.estimates import Estimates
@@ -17,41 +17,51 @@ __all__ = ["NativeStore", "filter_native"]
 _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
 
-_NOT_POSITIVE, _INFINITE = 1, 2  # bits of the kernel's status
+_NOT_POSITIVE, _DOUBTFUL = 1, 4  # bits of the kernel's status
 _WRITTEN = ("probs", "mean", "cov", "log_likelihood", "nis", "n_observed", "mode_means", "mode_covs")
 
 
-def filter_native(z: _Array, model: Aligned, *, per_mode: bool, every: bool, num_threads: int | None) -> Estimates:
-    """Run the compiled recursion over aligned arrays.
+def filter_native(
+    z: _Array, aligned: Callable[[bool], Aligned], *, per_mode: bool, every: bool, num_threads: int | None
+) -> Estimates:
+    """Run the compiled recursion.
 
     Args:
         z: the measurements with their NaN, (*batch, T, m).
-        model: the other arguments, aligned.
+        aligned: aligns the other arguments; True leaves the elements of large arrays to the kernel.
         per_mode: also return every mode's mean and covariance.
         every: keep all rows, not the last only.
         num_threads: threads to use; None chooses.
     """
+    model = aligned(True)
+    out, status = _run(z, model, per_mode, every, num_threads)
+    if status & _DOUBTFUL:  # read every element: raises, or makes nearly symmetric covariances symmetric
+        model = aligned(False)
+        out, status = _run(z, model, per_mode, every, num_threads)
+    if status & _NOT_POSITIVE:
+        raise NumericalError(NOT_POSITIVE)
+    return out
+
+
+def _run(z: _Array, model: Aligned, per_mode: bool, every: bool, num_threads: int | None) -> tuple[Estimates, int]:
     native = native_module()
     if native is None:
         raise ModelError("there is no compiled kernel here.")
     batch, (n_steps, m) = z.shape[:-2], z.shape[-2:]
     sizes, n, runs = model.sizes, model.cov0.shape[-1], prod(z.shape[:-2])
     out = _allocate(batch, n_steps if every else 1, n_steps, sizes, n, per_mode)
+    if runs == 0:
+        return out, 0
     work = float(runs) * n_steps * prod(sizes) * n * n * (n + m)
-    if runs:
-        status = native.imm_filter(
-            instruction_set(),
-            np.ascontiguousarray(z.reshape((runs, n_steps, m))),
-            _described(model, batch),
-            {name: getattr(out, name) for name in _WRITTEN},
-            every,
-            thread_count(num_threads, work),
-        )
-        if status & _INFINITE:
-            raise DataError("z holds an infinite number. A missing component is NaN.")
-        if status & _NOT_POSITIVE:
-            raise NumericalError(NOT_POSITIVE)
-    return out
+    status = native.imm_filter(
+        instruction_set(),
+        np.ascontiguousarray(z.reshape((runs, n_steps, m))),
+        _described(model, batch),
+        {name: getattr(out, name) for name in _WRITTEN},
+        every,
+        thread_count(num_threads, work),
+    )
+    return out, status
 
 
 def _allocate(

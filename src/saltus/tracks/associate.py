@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Pairs", "assign", "near_pairs"]
+__all__ = ["Pairs", "assign", "equal_codes", "join_pairs", "near_pairs"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -34,6 +34,22 @@ def near_pairs(tracks: _Array, reach: _Array, plots: _Array) -> Pairs:
     found = cKDTree(plots).query_ball_point(tracks, reach)
     counts = np.array([len(f) for f in found])
     return Pairs(np.repeat(np.arange(len(tracks)), counts), np.concatenate([np.asarray(f, np.intp) for f in found]))
+
+
+def equal_codes(tracks: npt.NDArray[np.integer], plots: npt.NDArray[np.integer]) -> Pairs:
+    """Return all pairs of equal codes; negative codes are unknown and equal nothing."""
+    order = np.argsort(plots, kind="stable")
+    sorted_plots = plots[order]
+    first = np.searchsorted(sorted_plots, tracks, side="left")
+    counts = np.where(tracks >= 0, np.searchsorted(sorted_plots, tracks, side="right") - first, 0)
+    within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return Pairs(np.repeat(np.arange(len(tracks)), counts), order[np.repeat(first, counts) + within])
+
+
+def join_pairs(a: Pairs, b: Pairs) -> Pairs:
+    """Return the pairs of both, each once."""
+    both = np.unique(np.stack([np.concatenate([a.track, b.track]), np.concatenate([a.plot, b.plot])]), axis=1)
+    return Pairs(both[0], both[1])
 
 
 def assign(pairs: Pairs, gain: _Array) -> _Index:

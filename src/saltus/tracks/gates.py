@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.associate import Pairs, near_pairs
+from saltus.tracks.associate import Pairs, equal_codes, join_pairs, near_pairs
 from saltus.tracks.identity import conflicting
 from saltus.tracks.kinematics import Kinematics, Moments, Plan
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
@@ -45,13 +45,11 @@ class Gate:
 
     def __init__(self, settings: TrackerSettings, filters: FilterSettings, *, use_identity: bool) -> None:
         """Fix thresholds from the settings."""
-        from scipy.stats import chi2
-
-        self.horizontal = float(chi2.ppf(settings.gate_probability, 2))
-        self.height = float(chi2.ppf(settings.gate_probability, 1))
-        self.fault = float(chi2.ppf(_FAULT_GATE, 2))
+        self.horizontal = _chi2_quantile(settings.gate_probability, 2)
+        self.height = _chi2_quantile(settings.gate_probability, 1)
+        self.fault = _chi2_quantile(_FAULT_GATE, 2)
         self._outlier_azimuth = float(np.radians(settings.outlier_azimuth))
-        self._outlier_range = settings.outlier_range
+        self._outlier_range, self._outlier_xy = settings.outlier_range, settings.outlier_xy
         self._accel = max(filters.accel_h)
         self._use_identity = use_identity
 
@@ -59,6 +57,8 @@ class Gate:
         """Pair tracks with the plots `index` of a slice inside their gates."""
         rows = life.rows()
         near = self._coarse(kinematics.moments(rows), life, rows, m, index)
+        if self._use_identity:
+            near = join_pairs(near, equal_codes(life.icao24[rows], m.icao24[index]))
         near = self._admissible(Pairs(rows[near.track], near.plot), life, m, index)
         dt = m.time[index[near.plot]] - life.time[near.track]
         offset = np.minimum(dt, 0.0)  # a plot of another source may come a little late
@@ -68,7 +68,8 @@ class Gate:
         y, S = _measured(*copies.widest(every), offset, R)
         d2_gate, d2_height = _distances(z - y, S)
         in_gate = d2_gate <= self.horizontal
-        R, fault = self._faults(~in_gate & (life.status[near.track] == CONFIRMED), z - y, S, R, m, index[near.plot])
+        trusted = (life.status[near.track] == CONFIRMED) | self._same_address(near, life, m, index)
+        R, fault = self._faults(~in_gate & trusted, z - y, S, R, m, index[near.plot])
         inside = np.flatnonzero(in_gate | (fault > 0))
         mixture = copies.moments(every)
         y_mixture, S_mixture = _measured(mixture.mean, mixture.cov, offset, R)
@@ -93,8 +94,8 @@ class Gate:
     ) -> tuple[_Array, npt.NDArray[np.int8]]:
         """Explain plots outside the gate of a confirmed track by a faulty azimuth or range where that fits."""
         fault = np.zeros(len(nu), np.int8)
-        at = np.flatnonzero(candidate & np.isfinite(m.ray[plot, 0]))
-        wide = m.faulty(plot[at], self._outlier_azimuth, self._outlier_range)
+        at = np.flatnonzero(candidate)
+        wide = m.faulty(plot[at], self._outlier_azimuth, self._outlier_range, self._outlier_xy)
         S_fault = (S[at] - R[at])[:, None] + wide
         d2 = np.stack([_distances(nu[at], S_fault[:, k])[0] for k in (0, 1)], axis=-1)
         log_f = -0.5 * (d2 + np.log(np.linalg.det(S_fault[..., :2, :2])))
@@ -118,8 +119,9 @@ class Gate:
         variance += 0.5 * (self._accel * longest**2) ** 2
         variance += float(np.trace(m.cov[index, :2, :2], axis1=1, axis2=2).max())
         reach = np.sqrt(self.horizontal * variance) + np.hypot(velocity[:, 0], velocity[:, 1]) * half
-        far = np.nan_to_num(np.hypot(m.ray[index, 0], m.ray[index, 1])).max()
-        astray = np.sqrt(self.fault) * np.hypot(self._outlier_range, self._outlier_azimuth * far)
+        far = np.hypot(m.ray[index, 0], m.ray[index, 1])
+        wrong = np.hypot(self._outlier_range, self._outlier_azimuth * far)
+        astray = np.sqrt(self.fault) * np.where(np.isnan(far), 1.5 * self._outlier_xy, wrong).max()
         reach = reach + np.where(life.status[rows] == CONFIRMED, astray, 0.0)
         return near_pairs(position, reach, m.position[index, :2])
 
@@ -131,6 +133,17 @@ class Gate:
         if self._use_identity:
             keep &= ~conflicting(life.icao24[pairs.track], m.icao24[plot])
         return Pairs(pairs.track[keep], pairs.plot[keep])
+
+    def _same_address(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> npt.NDArray[np.bool_]:
+        known = life.icao24[pairs.track] >= 0
+        return np.asarray(self._use_identity & known & (life.icao24[pairs.track] == m.icao24[index[pairs.plot]]))
+
+
+def _chi2_quantile(probability: float, dof: int) -> float:
+    """Quantile of the chi-square law (scipy.stats says the same, and takes a second to import)."""
+    from scipy.special import gammaincinv
+
+    return float(2.0 * gammaincinv(0.5 * dof, probability))
 
 
 def _span(time: _Array) -> tuple[float, float]:

@@ -82,18 +82,22 @@ class Measurements(NamedTuple):
         position[unknown, 2], cov[unknown, 2, 2] = prior[0], prior[1] ** 2
         return position, cov
 
-    def faulty(self, index: npt.NDArray[np.intp], sigma_azimuth: float, sigma_range: float) -> _Array:
+    def faulty(self, index: npt.NDArray[np.intp], sigma_azimuth: float, sigma_range: float, sigma_xy: float) -> _Array:
         """Return covariances (k, 2, 3, 3) of plots with a faulty azimuth, and with a faulty range.
 
         R + sigma_azimuth^2 c c' and R + sigma_range^2 u u', u the unit vector from the site and c the vector of
-        the same length as the ground range across it. NaN where the source is not polar.
+        the same length as the ground range across it. Where the source is not polar, its position is faulty:
+        R + sigma_xy^2 I, twice.
         """
         ray = self.ray[index]
-        across = np.stack([-ray[:, 1], ray[:, 0]], axis=-1) * sigma_azimuth
-        along = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * sigma_range
+        polar = np.isfinite(ray[:, 0])
+        away = np.where(polar[:, None], ray, (1.0, 0.0))
+        across = np.stack([-away[:, 1], away[:, 0]], axis=-1) * sigma_azimuth
+        along = away / np.linalg.norm(away, axis=-1, keepdims=True) * sigma_range
         shift = np.stack([across, along], axis=1)
+        spread = shift[..., :, None] * shift[..., None, :]
         cov = np.repeat(self.cov[index][:, None], 2, axis=1)
-        cov[..., :2, :2] += shift[..., :, None] * shift[..., None, :]
+        cov[..., :2, :2] += np.where(polar[:, None, None, None], spread, sigma_xy**2 * np.eye(2))
         return cov
 
     def split_from(

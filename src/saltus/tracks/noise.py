@@ -9,15 +9,17 @@ import numpy.typing as npt
 from saltus.records import Source
 from saltus.tracks.measurements import Measurements, Noise
 
-__all__ = ["NoiseEstimate", "apply_estimate", "estimate_noise"]
+__all__ = ["NoiseEstimate", "apply_estimate", "estimate_noise", "widened"]
 
 _Array = npt.NDArray[np.float64]
 
 _WINDOW = 7  # plots of one track in a row
 _MAX_ACCEL = 1.0  # m/s^2 over the window: straighter than any turn of an aircraft
+_MOVING = 3.0  # m/s
 _MAX_GAP = 2.5  # of the median interval: no window spans a longer gap
 _MIN_WINDOWS = 30  # fewer say nothing
 _TRIM = 4.0
+_SHARE, _CHI2_QUANTILE = 0.8, 3.2189  # of the chi-square law of two degrees of freedom
 _MAD = 1.4826  # normal standard deviation per median absolute deviation
 
 
@@ -52,14 +54,17 @@ def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int
     step = np.diff(m.time[window], axis=1)
     whole = (track_id[window] == track_id[window[:, :1]]).all(axis=1) & (step > 0).all(axis=1)
     whole &= step.max(axis=1) < _MAX_GAP * np.median(step[whole]) if whole.any() else False
-    residual, accel = _middle_residuals(time[whole], m.position[window[whole], :2])
+    residual, speed, accel = _middle_residuals(time[whole], m.position[window[whole], :2])
     straight = accel < _MAX_ACCEL
+    moving = straight & (speed > _MOVING)
+    if moving.sum() >= _MIN_WINDOWS:  # what stands still repeats one rounded position and shows no noise
+        straight = moving
     middle = window[whole, _WINDOW // 2][straight]
     return _scatter(residual[straight], m.ray[middle])
 
 
-def _middle_residuals(time: _Array, xy: _Array) -> tuple[_Array, _Array]:
-    """Return the middle plots' residuals in units of sigma's own, (W, 2), and the fitted accelerations, (W,)."""
+def _middle_residuals(time: _Array, xy: _Array) -> tuple[_Array, _Array, _Array]:
+    """Return the middle plots' residuals with variance sigma^2, (W, 2), fitted speeds and accelerations, (W,)."""
     scale = np.abs(time).max(axis=1, initial=0.0)[:, None]
     u = time / np.where(scale > 0, scale, 1.0)
     A = np.stack([np.ones_like(u), u, u * u], axis=-1)
@@ -68,7 +73,9 @@ def _middle_residuals(time: _Array, xy: _Array) -> tuple[_Array, _Array]:
     coefficients = pinv @ (xy - centre)
     leverage = pinv[:, 0, _WINDOW // 2]  # the middle plot is at u = 0
     residual = -coefficients[:, 0] / np.sqrt(1.0 - leverage)[:, None]
-    return residual, 2.0 * np.linalg.norm(coefficients[:, 2], axis=-1) / np.maximum(scale[:, 0], 1e-9) ** 2
+    unit = np.maximum(scale[:, 0], 1e-9)
+    speed, accel = np.linalg.norm(coefficients[:, 1:], axis=-1).T / np.stack([unit, 0.5 * unit**2])
+    return residual, speed, accel
 
 
 def _scatter(residual: _Array, ray: _Array) -> NoiseEstimate:
@@ -102,3 +109,20 @@ def apply_estimate(noise: Noise, estimate: NoiseEstimate, source: Source) -> Noi
         azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth),
         xy=at_least(estimate.xy, source.xy_lsb, noise.xy),
     )
+
+
+def widened(noise: Noise, d2: _Array) -> Noise:
+    """Widen the noise of a source whose innovations are larger than it explains.
+
+    Errors that persist from plot to plot (multilateration, satellite navigation) hardly show in the scatter about a
+    short curve, but they do in the innovations: where the 0.8 quantile of d2 = nu' S^-1 nu exceeds that of its law,
+    every standard deviation grows by the root of the ratio.
+
+    Args:
+        noise: what the tracks were made with.
+        d2: of updates in steady motion, two degrees of freedom.
+    """
+    if len(d2) < _MIN_WINDOWS:
+        return noise
+    factor = float(np.sqrt(max(1.0, float(np.quantile(d2, _SHARE)) / _CHI2_QUANTILE)))
+    return replace(noise, range=noise.range * factor, azimuth=noise.azimuth * factor, xy=noise.xy * factor)

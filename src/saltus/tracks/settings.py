@@ -69,10 +69,12 @@ class TrackerSettings:
             source and scan that updated a confirmed track, with no other height or identity, is a split plot.
         split_azimuth: see split_range.
         altitude_outlier: probability that a plot's height is wrong (garbled Mode C); such a height is ignored.
-        plot_outlier: probability that a radar plot's azimuth, or its range, is faulty; a confirmed track that no
-            plot in its gate explains takes such a plot with the deviations below.
+        plot_outlier: probability that a radar plot's azimuth, or its range, is faulty, or the position of another
+            sensor; a plot outside the gate of a confirmed track, or of one of its own address, may still be taken
+            for such a fault, with the deviations below.
         outlier_azimuth: standard deviation of a faulty azimuth, degrees.
         outlier_range: standard deviation of a faulty range, m.
+        outlier_xy: standard deviation of a faulty position, each axis, m.
         height_prior: mean and standard deviation of the height of targets that do not tell it, m.
         sigma_pressure: error of pressure altitude as geometric height, m; widens the published covariance near
             the radar, where height bends slant range.
@@ -92,6 +94,7 @@ class TrackerSettings:
     plot_outlier: float = 1e-3
     outlier_azimuth: float = 1.5
     outlier_range: float = 400.0
+    outlier_xy: float = 200.0
     height_prior: tuple[float, float] = (5000.0, 3500.0)
     sigma_pressure: float = 100.0
 

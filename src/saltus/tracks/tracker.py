@@ -161,7 +161,8 @@ class Tracker:
         self._start(rows[seed], plots[seed])
         self._kinematics.put(rows[~seed], gated.copies, gated.copy[chosen[~seed]])
         self._enter(rows, plots, period, gated.height_used[chosen])
-        d2 = np.where(seed, np.nan, gated.d2[chosen])  # a start has no innovation of a filter
+        # Neither a start nor a fault says whether the filter's innovations are what it thinks.
+        d2 = np.where(seed | (gated.fault[chosen] > 0), np.nan, gated.d2[chosen])
         self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2)
         left = np.setdiff1d(np.arange(len(index)), gated.pairs.plot[chosen])
         self._begin(index[left], plots[life.status[rows] == CONFIRMED], period)
@@ -236,7 +237,7 @@ class Tracker:
             self._emit(
                 Rows(
                     life.id[rows],
-                    self._m.time[plots],
+                    life.time[rows],  # of the state: a late plot is older
                     moments,
                     life.status[rows],
                     life.has_altitude[rows],
