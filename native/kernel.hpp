@@ -16,7 +16,9 @@ struct Model {
   const int* which = nullptr;
 };
 
-enum Status : int { kFine = 0, kNotPositive = 1, kInfinite = 2 };
+// kDoubtful: a model array given per track holds NaN, inf, or a covariance that is not exactly symmetric or has a
+// negative diagonal. Such arrays are too large to be read twice, so they are checked as they are loaded.
+enum Status : int { kFine = 0, kNotPositive = 1, kInfinite = 2, kDoubtful = 4 };
 
 struct Problem {
   std::ptrdiff_t n_tracks = 0, n_steps = 0;

@@ -136,8 +136,12 @@ class Recursion {
 
   static ByMode<double> shared(const Model& model, Size k) { return by_mode(model, address(model, 0, k)); }
 
-  ByMode<V> by_lane(const Model& model, Size k, V* staged) {
-    if (k == 0 || model.time) load_model(model, first, p.n_tracks, k, staged);
+  // `order` is that of a covariance, 0 for any other array.
+  ByMode<V> by_lane(const Model& model, Size k, V* staged, int order) {
+    if (k == 0 || model.time) {
+      load_model(model, first, p.n_tracks, k, staged);
+      if (model.row && any(doubtful(model, staged, order))) status |= kDoubtful;
+    }
     return by_mode<V>(model, staged);
   }
 
@@ -157,7 +161,8 @@ class Recursion {
     }
     if (logs) logs = still_in_logs(law, p.modes);
     if (dynamics_by_lane)
-      steps.lanes.propagate(state, n, p.modes, by_lane(p.F, k, F), by_lane(p.b, k, b), by_lane(p.Q, k, Q), heap);
+      steps.lanes.propagate(state, n, p.modes, by_lane(p.F, k, F, 0), by_lane(p.b, k, b, 0), by_lane(p.Q, k, Q, n),
+                            heap);
     else
       steps.shared.propagate(state, n, p.modes, shared(p.F, k), shared(p.b, k), shared(p.Q, k), heap);
   }
@@ -175,8 +180,8 @@ class Recursion {
     *n_observed = seen;
     I bad;
     if (sensor_by_lane)
-      bad = steps.lanes.update(state, n, m, p.modes, by_lane(p.H, k, H), by_lane(p.d, k, d), by_lane(p.R, k, R), z, on,
-                               report, heap);
+      bad = steps.lanes.update(state, n, m, p.modes, by_lane(p.H, k, H, 0), by_lane(p.d, k, d, 0), by_lane(p.R, k, R, m),
+                               z, on, report, heap);
     else
       bad = steps.shared.update(state, n, m, p.modes, shared(p.H, k), shared(p.d, k), shared(p.R, k), z, on, report,
                                 heap);

@@ -69,6 +69,20 @@ inline void load_model(const Model& model, Size first, Size n_tracks, Size step,
   load_lanes(rows, count, out);
 }
 
+// Lanes in which a loaded array holds NaN or inf or, for matrices of order n > 0, is no covariance on the face of it.
+inline I doubtful(const Model& model, const V* loaded, int n) {
+  I bad{};
+  const int count = model.distinct * model.core;
+  for (int i = 0; i < count; ++i) bad |= ~(loaded[i] - loaded[i] == 0.0);
+  if (n == 0) return bad;
+  for (const V* a = loaded; a < loaded + count; a += n * n)
+    for (int i = 0; i < n; ++i) {
+      bad |= a[i * n + i] < 0.0;
+      for (int j = 0; j < i; ++j) bad |= a[i * n + j] != a[j * n + i];
+    }
+  return bad;
+}
+
 inline std::size_t lanes_of(const Model& model) { return model.data ? model.distinct * model.core : 0; }
 
 // Where element i of a full symmetric matrix lies in a packed one, for `index` of store_lanes.
