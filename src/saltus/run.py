@@ -250,7 +250,7 @@ def _steady_d2(rows: Sequence[Rows], m: Measurements, s: int) -> _Array:
     """Return the innovations of one source's updates in steady motion, as squared Mahalanobis distances."""
     all_rows = join_rows(rows)
     at = (all_rows.measurement >= 0) & (m.source[all_rows.measurement] == s)
-    return all_rows.d2[at & (all_rows.moments.p_manoeuvre_h < 0.5) & np.isfinite(all_rows.d2)]
+    return np.asarray(all_rows.d2[at & (all_rows.moments.p_manoeuvre_h < 0.5) & np.isfinite(all_rows.d2)])
 
 
 def _configured(plots: Plots, s: int, given: dict[str, float]) -> bool:

@@ -27,7 +27,7 @@ class Record(NamedTuple):
 class IMM:
     """The interacting-multiple-model filter on the product of a model's chains.
 
-    `IMM(model).run(records)` filters records; `IMM(per_mode=True)` holds settings, and calling it with a model binds it.
+    `IMM(model).run(records)` filters records; `IMM(per_mode=True)` holds settings, and a call with a model binds it.
 
     Attributes:
         model: the model it is bound to, or None.

@@ -18,7 +18,7 @@ _OTHER_CODE = -4.0  # codes change in flight and are garbled: less likely, never
 
 def conflicting(track_icao24: _Codes, plot_icao24: _Codes) -> npt.NDArray[np.bool_]:
     """Say where two known Mode S addresses differ: one plot cannot be the other's aircraft."""
-    return (track_icao24 >= 0) & (plot_icao24 >= 0) & (track_icao24 != plot_icao24)
+    return np.asarray((track_icao24 >= 0) & (plot_icao24 >= 0) & (track_icao24 != plot_icao24))
 
 
 def identity_gain(track_icao24: _Codes, plot_icao24: _Codes, track_mode3a: _Codes, plot_mode3a: _Codes) -> _Array:

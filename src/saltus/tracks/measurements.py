@@ -1,8 +1,7 @@
 """Reports as positions with covariances in the tracker's plane."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -52,7 +51,8 @@ def default_noise(source: Source) -> Noise:
     )
 
 
-class Measurements(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurements:
     """Usable reports in time order; `plot` is their index in the recording's plots."""
 
     plot: npt.NDArray[np.intp]  # (N,)
@@ -67,13 +67,13 @@ class Measurements(NamedTuple):
     ray: _Array  # (N, 2): from the site to the position in the plane, m; NaN where the source is not polar
     lever: _Array  # (N, 2): change of plane position per metre of height error, 0 where none
 
-    def __len__(self) -> int:  # a NamedTuple counts its fields otherwise
+    def __len__(self) -> int:
         """Number of measurements."""
         return len(self.time)
 
     def take(self, index: npt.NDArray[np.intp]) -> "Measurements":
         """Return the measurements selected."""
-        return Measurements(*(column[index] for column in self))
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def with_height(self, index: npt.NDArray[np.intp], prior: tuple[float, float]) -> tuple[_Array, _Array]:
         """Return positions (k, 3) and covariances, heights unknown replaced by their prior (mean, sd)."""
