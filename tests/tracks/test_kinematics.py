@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import block_diag, expm
 
 from saltus.filters import imm_filter
-from saltus.tracks.kinematics import Plan, Start, make_kinematics, two_point_start
+from saltus.tracks.kinematics import Plan, Start, make_kinematics, two_point_start, with_speed_prior
 from saltus.tracks.settings import FilterSettings
 
 STEPS = np.array([4.0, 3.7, 4.4, 8.1, 0.2, 4.0])
@@ -197,3 +197,14 @@ def test_two_point_start_agrees_with_the_reference_case(cases):
     np.testing.assert_allclose(start.cov[0, :4, :4], case["P0"], rtol=1e-8, atol=1e-8 * np.abs(case["P0"]).max())
     np.testing.assert_allclose(start.mean[0, 4:], case["z0"], rtol=1e-8)
     np.testing.assert_allclose(start.cov[0, 4:, 4:], case["Z0"], rtol=1e-8)
+
+
+def test_a_speed_prior_is_a_measurement_of_no_speed(rng):
+    """Against the information form: the inverse covariance gains 1 / sigma^2 on each horizontal velocity."""
+    start = Start(rng.normal(0, 300, (4, 6)), spd(rng, 4, n=6) * 1e4)
+    found = with_speed_prior(start, 400.0)
+    for k in range(4):
+        information = np.linalg.inv(start.cov[k])
+        total = information + np.diag([0, 1, 0, 1, 0, 0]) / 400.0**2
+        np.testing.assert_allclose(found.cov[k], np.linalg.inv(total), rtol=1e-8)
+        np.testing.assert_allclose(found.mean[k], np.linalg.solve(total, information @ start.mean[k]), rtol=1e-8)

@@ -198,6 +198,38 @@ def test_two_radars_update_common_tracks(rng):
     assert np.trace(found.rows.moments.cov[-1]) < np.trace(alone.rows.moments.cov[-1])
 
 
+def test_plots_of_a_late_source_update_the_track_where_the_target_was(rng):
+    """Two sources in step, the second's plots 0.3 s older than the first's of the same slice.
+
+    A late plot may not pull the track back by the 75 m that are flown in between.
+    """
+    n, speed, sigma = 40, 250.0, 5.0
+    time = np.sort(np.concatenate([DT * np.arange(n) + 0.3, DT * np.arange(n)]))
+    source = np.tile([1, 0], n)  # the later plot belongs to the source taken first
+    xy = np.column_stack([speed * time, np.full(2 * n, 3e4)]) + sigma * rng.standard_normal((2 * n, 2))
+    m = measured(time, xy, sigma, source=source)
+    found = run(m, periods=(DT, DT))
+    assert len(np.unique(found.track_id[4:])) == 1  # each source may begin a track of its own
+    assert found.track_id[-1] > 0
+    late = found.rows.time > 40.0
+    error = found.rows.moments.mean[late][:, [0, 2]] - np.column_stack(
+        [speed * found.rows.time[late], np.full(late.sum(), 3e4)]
+    )
+    assert np.abs(error).max() < 6 * sigma  # whatever time a row states, it is where the target was then
+    assert np.abs(found.rows.moments.mean[late][:, 1] - speed).max() < 20.0
+
+
+def test_a_start_from_two_radars_at_nearly_one_time(rng):
+    """Plots 10 ms apart tell no velocity: what is known of speeds must stay known."""
+    n = 12
+    time = np.sort(np.concatenate([DT * np.arange(n), DT * np.arange(n) + 0.01]))
+    xy = np.column_stack([200.0 * time, np.full(2 * n, 3e4)]) + 50.0 * rng.standard_normal((2 * n, 2))
+    found = run(measured(time, xy, 50.0, source=np.tile([0, 1], n)), periods=(DT, DT))
+    assert len(np.unique(found.track_id)) == 1
+    speed = np.hypot(*found.all_rows.moments.mean[:, [1, 3]].T)
+    assert speed.max() < 1500.0
+
+
 def scene(rng, seconds=160.0):
     """Eight aircraft, two of them turning, seen by two radars with misses and clutter."""
     way = [

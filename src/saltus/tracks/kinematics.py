@@ -10,7 +10,16 @@ from saltus.filters import Bank, Belief
 from saltus.models import Chain, Motion, constant_velocity
 from saltus.tracks.settings import FilterSettings
 
-__all__ = ["Channel", "Kinematics", "Moments", "Plan", "Start", "make_kinematics", "two_point_start"]
+__all__ = [
+    "Channel",
+    "Kinematics",
+    "Moments",
+    "Plan",
+    "Start",
+    "make_kinematics",
+    "two_point_start",
+    "with_speed_prior",
+]
 
 _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
@@ -131,7 +140,7 @@ class Kinematics:
         for channel in self.channels:
             s = channel.states
             belief = channel.bank.read(rows)
-            last = (slice(None), *(-1 for _ in channel.chains))
+            last: tuple[slice | int, ...] = (slice(None), *(-1 for _ in channel.chains))
             mean[:, s], cov[:, s[:, None], s] = belief.means[last], belief.covs[last]
         return mean, cov
 
@@ -201,3 +210,21 @@ def two_point_start(first: _Array, first_cov: _Array, second: _Array, second_cov
     cov[:, 0::2, 1::2] = cov[:, 1::2, 0::2] = second_cov / T
     cov[:, 1::2, 1::2] = (first_cov + second_cov) / (T * T)
     return Start(mean, cov)
+
+
+def with_speed_prior(start: Start, sigma: float) -> Start:
+    """Condition states on their horizontal velocity being N(0, sigma^2 I).
+
+    With U = cov(x, v), S = cov(v) + sigma^2 I: x - U S^-1 v, P - U S^-1 U'. Two positions taken at nearly one time (two
+    radars) tell no velocity; this keeps what is known of speeds, and changes nothing else.
+
+    Args:
+        start: states (x, vx, y, vy, z, vz).
+        sigma: standard deviation of each component, m/s.
+    """
+    v = np.array([1, 3])
+    U = start.cov[:, :, v]
+    S = start.cov[:, v[:, None], v] + sigma**2 * np.eye(2)
+    gain = np.linalg.solve(S, U.swapaxes(-1, -2)).swapaxes(-1, -2)
+    cov = start.cov - gain @ U.swapaxes(-1, -2)
+    return Start(start.mean - (gain @ start.mean[:, v, None])[..., 0], 0.5 * (cov + cov.swapaxes(-1, -2)))

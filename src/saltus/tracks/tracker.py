@@ -9,7 +9,7 @@ import numpy.typing as npt
 from saltus.tracks.associate import assign
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
-from saltus.tracks.kinematics import Moments, Start, make_kinematics, two_point_start
+from saltus.tracks.kinematics import Moments, Start, make_kinematics, two_point_start, with_speed_prior
 from saltus.tracks.lifecycle import COASTED, CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
@@ -187,6 +187,7 @@ class Tracker:
         m, life, prior = self._m, self._life, self._settings.height_prior
         first, dt = life.plot[rows], m.time[plots] - life.time[rows]
         start = two_point_start(*m.with_height(first, prior), *m.with_height(plots, prior), dt)
+        start = with_speed_prior(start, self._settings.max_speed)
         # The target may have manoeuvred between the two.
         start.cov[:, [1, 3], [1, 3]] += self._mean_accel_sq * (0.5 * dt[:, None]) ** 2
         known = np.isfinite(m.position[plots, 2])
