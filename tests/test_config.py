@@ -68,7 +68,7 @@ def test_tables_are_known_by_name(tmp_path):
         (SENSOR.replace("2.1", "inf"), "longitude = inf"),
         (SENSOR.replace("129", "300"), "sic = 300"),
         (SENSOR.replace("41.3", '"41"'), "latitude = '41'"),
-        (SENSOR.replace("latitude = 41.3\n", ""), "latitude is missing"),
+        (SENSOR.replace("latitude = 41.3\n", ""), "latitude and longitude go together"),
         (SENSOR.replace("sic = 129\n", ""), "sac and sic go together"),
         (SENSOR + "height = 29000", r"height = 29000.*1 ft = 0\.3048 m"),
         (SENSOR + "sigma_range = 0", "sigma_range = 0.*greater than 0"),

@@ -35,14 +35,23 @@ def main() -> None:
 
 
 @main.command()
-@click.argument("inputs", nargs=-1, required=True, type=_FILE)
+@click.argument("inputs", nargs=-1, type=_FILE)
 @click.option("--config", type=_FILE, help="TOML file: date, editions.")
 @click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
-def info(inputs: tuple[Path, ...], config: Path | None, date: str | None) -> None:
+@click.option("--system", is_flag=True, help="Say which kernel and instruction set this installation uses.")
+def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, system: bool) -> None:
     """Say what is in a recording: systems, counts, time span, period, fields, rejected reports."""
-    from saltus.info import show_info
+    if system:
+        from saltus.filters.backend import system_report
 
-    show_info(inputs, config, date)
+        for name, value in system_report().items():
+            click.echo(f"{name}: {value}")
+    elif not inputs:
+        raise click.UsageError("name at least one recording, or --system.")
+    if inputs:
+        from saltus.info import show_info
+
+        show_info(inputs, config, date)
 
 
 @main.command()
@@ -77,9 +86,12 @@ def track(
 @click.option("--seed", type=int, default=0, show_default=True)
 def study(name: str, output: Path, runs: int | None, seed: int) -> None:
     """Run the study NAME: metrics.json and pictures in OUTPUT."""
+    from saltus.progress import progress_bar
     from saltus.studies import run_study
 
-    run_study(name, output, runs, seed)
+    with progress_bar() as bar:
+        run_study(name, output, runs, seed, progress=lambda done, all_runs: bar.working(name, done / all_runs))
+    click.echo(f"written to {output}/")
 
 
 @main.command()

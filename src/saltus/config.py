@@ -64,8 +64,8 @@ class SensorConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-    latitude: Annotated[float, Field(ge=-90.0, le=90.0)]
-    longitude: Annotated[float, Field(ge=-180.0, le=180.0)]
+    latitude: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
+    longitude: Annotated[float, Field(ge=-180.0, le=180.0)] | None = None
     sac: _Octet | None = None
     sic: _Octet | None = None
     height: Annotated[float, Field(ge=-450.0, le=9000.0)] | None = None
@@ -82,6 +82,8 @@ class SensorConfig(BaseModel):
             raise ValueError("sac and sic go together: give both")
         if self.sac is None and not self.name:
             raise ValueError("give sac and sic, or for tables the name of the source")
+        if (self.latitude is None) != (self.longitude is None):
+            raise ValueError("latitude and longitude go together: give both, or neither to configure noise alone")
         return self
 
     def matches(self, system: System) -> bool:

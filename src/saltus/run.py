@@ -202,7 +202,9 @@ def _sensors(sources: Sequence[Source], recording: Recording, config: Config) ->
     return _Sensors(sites, configured, periods, names)
 
 
-def _site(sensor: SensorConfig) -> Site:
+def _site(sensor: SensorConfig) -> Site | None:
+    if sensor.latitude is None or sensor.longitude is None:
+        return None
     latitude, longitude = np.radians([sensor.latitude, sensor.longitude])
     height, sigma = _UNKNOWN_HEIGHT if sensor.height is None else (sensor.height, 0.0)
     return Site(float(latitude), float(longitude), height, sigma)

@@ -83,8 +83,12 @@ def _rows(
     p_h, p_v = numbers(tracks, "p_manoeuvre_h"), numbers(tracks, "p_manoeuvre_v")
     last = np.append(starts[1:], len(ids)) - 1
     measured = status != _COASTED
-    jumping = (np.fmax(p_h, p_v) > 0.5) & measured
-    moving = (numbers(tracks, "speed_mps") > MOVING) & measured
+    speed = numbers(tracks, "speed_mps")
+    # Parked transponders seem to jump about: what moves does so at a tenth of the traffic's speed at least.
+    known = speed[measured & np.isfinite(speed)]
+    floor = max(MOVING, 0.1 * float(np.quantile(known, 0.95))) if len(known) else MOVING
+    moving = (speed > floor) & measured
+    jumping = (np.fmax(p_h, p_v) > 0.5) & moving
     max_h, max_v = np.fmax.reduceat(p_h, starts), np.fmax.reduceat(p_v, starts)
     n_coasted = np.add.reduceat(status == _COASTED, starts, dtype=np.int64)
     n_all = last + 1 - starts

@@ -15,6 +15,7 @@ from saltus.geo import (
     local_to_plane,
     polar_to_plane,
     spherical_to_plane,
+    wrap,
 )
 from saltus.records import Kind, Plots, Source
 
@@ -130,7 +131,8 @@ def make_plane(plots: Plots, sites: Sequence[Site | None]) -> Plane:
     """
     known = [s for s in sites if s is not None]
     if known:
-        return Plane(float(np.mean([s.latitude for s in known])), float(np.mean([s.longitude for s in known])))
+        east = known[0].longitude + wrap([s.longitude - known[0].longitude for s in known])  # also across 180 degrees
+        return Plane(float(np.mean([s.latitude for s in known])), float(wrap(np.mean(east))))
     at = (plots.kind == Kind.GEODETIC) & (plots.reason == 0)
     if not at.any():
         raise DataError(
