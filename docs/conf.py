@@ -30,6 +30,7 @@ python_maximum_signature_line_length = 88
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 napoleon_attr_annotations = False
+math_eqref_format = "equation {number}"
 add_module_names = False
 toc_object_entries_show_parents = "hide"
 
@@ -176,11 +177,11 @@ def as_signature(app, what, name, obj, options, signature, returned):
 
 def shortened(signature: str) -> str:
     """Put aliases back in place of what Python expands them to."""
-    like = r"_Buffer \| _SupportsArray\[.*?\] \| _NestedSequence\[_SupportsArray\[.*?\]+ \| (?:\w+ \| )*?"
-    like += r"_NestedSequence\[complex \| bytes \| str\]"
+    signature = re.sub(r"~?\b(?:numpy|typing|collections|dataclasses|jaxtyping)(?:\.\w+)*\.(?=\w)", "", signature)
+    like = r"_Buffer \| _SupportsArray\[dtype\[Any\]\] \| _NestedSequence\[_SupportsArray\[dtype\[Any\]\]\]"
+    like += r" \| (?:\w+ \| )*_NestedSequence\[[\w| ]+\]"
     signature = re.sub(like, "ArrayLike", signature)
-    signature = re.sub(r"ndarray\[tuple\[Any, \.\.\.\], dtype\[(\w+)\]\]", r"NDArray[\1]", signature)
-    return re.sub(r"(?:collections\.abc|dataclasses|jaxtyping|numpy)\.(?=\w)", "", signature)
+    return re.sub(r"ndarray\[tuple\[Any, \.\.\.\], dtype\[(\w+)\]\]", r"NDArray[\1]", signature)
 
 
 def skip_member(app, what, name, obj, skip, options):
