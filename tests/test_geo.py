@@ -471,3 +471,28 @@ def test_geodetic_reports():
     sd = np.sqrt(out.cov[:, [0, 1], [0, 1]])
     np.testing.assert_allclose(sd, [[10, 10], [20, 20]], rtol=1e-3)
     np.testing.assert_array_equal(out.altitude_var, [64.0, np.inf])
+
+
+@pytest.mark.parametrize("kind", ["polar", "spherical", "local"])
+def test_a_site_for_each_report_places_it_as_that_site_alone(kind, rng):
+    n = 40
+    lat, lon, h = 0.7 + 0.02 * rng.random(n), 0.02 * rng.random(n), 3000.0 * rng.random(n)
+    plane = centred_plane(geo.Site(0.71, 0.01, 0.0))
+    slant, azimuth = 100.0 + 60e3 * rng.random(n), 6.2 * rng.random(n)
+    slant[:4] = 200.0  # below a target straight above: integrated over the height
+    altitude = np.where(rng.random(n) < 0.3, np.nan, h + 9e3 * rng.random(n))
+
+    def place(at, site):
+        sigma = {"sigma_range": 30.0, "sigma_azimuth": 1e-3}
+        if kind == "polar":
+            return geo.polar_to_plane(slant[at], azimuth[at], altitude[at], site, plane, sigma_altitude=20.0, **sigma)
+        if kind == "spherical":
+            return geo.spherical_to_plane(slant[at], azimuth[at], 0.1, site, plane, sigma_elevation=2e-3, **sigma)
+        x, y = slant[at] * np.sin(azimuth[at]), slant[at] * np.cos(azimuth[at])
+        return geo.local_to_plane(x, y, altitude[at], site, plane, 30.0, 20.0)
+
+    together = place(np.arange(n), geo.Sites(lat, lon, h, 5.0))
+    for k in range(n):
+        alone = place(np.array([k]), geo.Site(lat[k], lon[k], h[k], 5.0))
+        for a, b in zip(together, alone, strict=True):
+            np.testing.assert_allclose(a[k], b[0], rtol=1e-9, atol=1e-6)

@@ -6,6 +6,7 @@ Heights above mean sea level and pressure altitudes are taken as heights above t
 
 from saltus.geo.earth import (
     Site,
+    Sites,
     ecef_to_geodetic,
     geodetic_to_ecef,
     geodetic_to_polar,
@@ -29,6 +30,7 @@ __all__ = [
     "Plane",
     "PlanePositions",
     "Site",
+    "Sites",
     "TrueState",
     "ecef_to_geodetic",
     "geodetic_to_ecef",

@@ -10,6 +10,7 @@ from saltus.errors import ModelError
 
 __all__ = [
     "Site",
+    "Sites",
     "ecef_to_geodetic",
     "geodetic_to_ecef",
     "geodetic_to_polar",
@@ -59,6 +60,16 @@ class Site:
             )
         if abs(self.latitude) > np.pi / 2 or abs(self.longitude) > 2 * np.pi:
             raise ModelError(f"site outside the earth: {self}. Give latitude and longitude in radians.")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sites:
+    """Where a moving sensor stood at each of N reports; where a `Site` is taken, one element for each report."""
+
+    latitude: npt.NDArray[np.float64]  # (N,), rad
+    longitude: npt.NDArray[np.float64]  # (N,), rad
+    height: npt.NDArray[np.float64]  # (N,), m
+    sigma_height: float = 0.0
 
 
 def radius_of_curvature(latitude: npt.ArrayLike, azimuth: npt.ArrayLike) -> Float[np.ndarray, "*lead"]:
@@ -145,7 +156,7 @@ def slant_to_ground(
 
 
 def polar_to_geodetic(
-    slant: npt.ArrayLike, azimuth: npt.ArrayLike, altitude: npt.ArrayLike, site: Site
+    slant: npt.ArrayLike, azimuth: npt.ArrayLike, altitude: npt.ArrayLike, site: Site | Sites
 ) -> tuple[
     Float[np.ndarray, "*lead"],
     Float[np.ndarray, "*lead"],
@@ -161,7 +172,7 @@ def polar_to_geodetic(
         slant: slant range, m.
         azimuth: at the site, rad from north, clockwise.
         altitude: height of the point, m.
-        site: the sensor's site.
+        site: the sensor's site, or one for each point.
 
     Returns:
         Latitude and longitude of the point (rad), and elevation and azimuth of the ray *at the point*, seen in the
@@ -171,7 +182,7 @@ def polar_to_geodetic(
     r, beta, h = np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (slant, azimuth, altitude)))
     hs, big_r = site.height, radius_of_curvature(site.latitude, beta)
     origin = geodetic_to_ecef(site.latitude, site.longitude, hs)
-    east, north, up = local_basis(site.latitude, site.longitude)
+    east, north, up = np.moveaxis(local_basis(site.latitude, site.longitude), -2, 0)
     level = np.sin(beta)[..., None] * east + np.cos(beta)[..., None] * north
     safe = np.where(r > 0.0, r, 1.0)
     sine = np.clip(((h - hs) * (2.0 * big_r + h + hs) - r**2) / (2.0 * safe * (big_r + hs)), -1.0, 1.0)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.geo.earth import Site, ecef_to_geodetic, geodetic_to_ecef, local_basis, polar_to_geodetic
+from saltus.geo.earth import Site, Sites, ecef_to_geodetic, geodetic_to_ecef, local_basis, polar_to_geodetic
 from saltus.geo.ground import ground_range
 from saltus.geo.plane import Plane, true_from_plane
 from saltus.geo.spherical import spherical_to_cartesian, variance
@@ -31,7 +31,7 @@ def polar_to_plane(
     slant: npt.ArrayLike,
     azimuth: npt.ArrayLike,
     altitude: npt.ArrayLike,
-    site: Site,
+    site: Site | Sites,
     plane: Plane,
     *,
     sigma_range: npt.ArrayLike,
@@ -56,7 +56,7 @@ def polar_to_plane(
         slant: slant range, m, (N,).
         azimuth: rad from north, clockwise, (N,).
         altitude: m, (N,); NaN where unknown.
-        site: where the radar stands.
+        site: where the radar stands, or stood at each report.
         plane: the plane of the result.
         sigma_range: standard deviation of the slant range, m, scalar or (N,), as are the next two.
         sigma_azimuth: of the azimuth, rad.
@@ -96,7 +96,7 @@ def spherical_to_plane(
     slant: npt.ArrayLike,
     azimuth: npt.ArrayLike,
     elevation: npt.ArrayLike,
-    site: Site,
+    site: Site | Sites,
     plane: Plane,
     *,
     sigma_range: npt.ArrayLike,
@@ -113,7 +113,7 @@ def spherical_to_plane(
         slant: slant range, m, (N,).
         azimuth: rad from north, clockwise, (N,).
         elevation: rad above the site's horizontal plane, (N,).
-        site: where the radar stands.
+        site: where the radar stands, or stood at each report.
         plane: the plane of the result.
         sigma_range: standard deviation of the slant range, m, scalar or (N,), as are the next two.
         sigma_azimuth: of the azimuth, rad.
@@ -139,7 +139,7 @@ def local_to_plane(
     x: npt.ArrayLike,
     y: npt.ArrayLike,
     altitude: npt.ArrayLike,
-    site: Site,
+    site: Site | Sites,
     plane: Plane,
     sigma_xy: npt.ArrayLike,
     sigma_altitude: npt.ArrayLike,
@@ -153,7 +153,7 @@ def local_to_plane(
         x: east of the site, m, (N,).
         y: north of the site, m, (N,).
         altitude: m, (N,); NaN where unknown.
-        site: origin of x and y.
+        site: origin of x and y, or one for each report.
         plane: the plane of the result.
         sigma_xy: standard deviation of x and of y, m, scalar or (N,).
         sigma_altitude: of the altitude, m; ignored where that is unknown.
@@ -214,11 +214,12 @@ def _outer(vectors: Array) -> Array:
     return np.asarray(vectors[..., :, None] * vectors[..., None, :])
 
 
-def _place(local: Array, site: Site) -> tuple[Array, Array, Array, Array]:
+def _place(local: Array, site: Site | Sites) -> tuple[Array, Array, Array, Array]:
     """Points east, north, up of a site: latitude, longitude, height, and the turn to their own axes."""
     basis = local_basis(site.latitude, site.longitude)
-    lat, lon, h = ecef_to_geodetic(geodetic_to_ecef(site.latitude, site.longitude, site.height) + local @ basis)
-    return lat, lon, h, local_basis(lat, lon) @ basis.T
+    offset = (local[..., None, :] @ basis)[..., 0, :]
+    lat, lon, h = ecef_to_geodetic(geodetic_to_ecef(site.latitude, site.longitude, site.height) + offset)
+    return lat, lon, h, local_basis(lat, lon) @ np.swapaxes(basis, -1, -2)
 
 
 def _plane_from_true(plane: Plane, lat: Array, lon: Array, altitude: Array) -> Array:
