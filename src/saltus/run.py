@@ -34,7 +34,7 @@ __all__ = ["track_files"]
 _Array = npt.NDArray[np.float64]
 
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
-_NOISE_PLOTS = 10_000  # reports of each source that the noise is estimated from before tracking
+_NOISE_PLOTS = 5_000  # reports of each source that the noise is estimated from before tracking
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
 _SIGMAS = {  # by whether the source is polar: label, field of Noise, unit
     True: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),

@@ -9,11 +9,11 @@ from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.checks import FloatArray, intervals, numbers, same, unit_steps
-from saltus.models.exponential import exponential
 from saltus.models.markov import (
     Labelled,
     generator,
     initial_law,
+    jump_matrices,
     logarithm,
     sojourn_matrix,
     stay_matrix,
@@ -149,8 +149,7 @@ class Chain:
         """
         interval = intervals(dt)
         if self._rates is not None:
-            result = np.maximum(exponential(self._rates * interval[..., None, None]), 0.0)
-            return np.asarray(result / result.sum(axis=-1, keepdims=True))
+            return jump_matrices(self._rates, interval)
         trans = np.asarray(self.trans)
         if self.per is None and self.memoryless:
             return np.broadcast_to(trans, (*interval.shape, *trans.shape)).copy()

@@ -10,7 +10,16 @@ from saltus.errors import ModelError
 from saltus.models.checks import FloatArray, numbers
 from saltus.models.exponential import exponential
 
-__all__ = ["Labelled", "generator", "initial_law", "logarithm", "sojourn_matrix", "stay_matrix", "stochastic"]
+__all__ = [
+    "Labelled",
+    "generator",
+    "initial_law",
+    "jump_matrices",
+    "logarithm",
+    "sojourn_matrix",
+    "stay_matrix",
+    "stochastic",
+]
 
 
 class Labelled(NamedTuple):
@@ -116,6 +125,23 @@ def generator(chain: Labelled, rates: npt.ArrayLike | None) -> FloatArray:
     array = off - np.diag(off.sum(axis=1))
     array.flags.writeable = False
     return array
+
+
+def jump_matrices(rates: FloatArray, dt: FloatArray) -> FloatArray:
+    """Transition matrices expm(rates dt), (..., M, M), rows sum to 1.
+
+    Two states that leave at rates a and b: [[1 - a e, a e], [b e, 1 - b e]], e = (1 - exp(-(a + b) dt)) / (a + b).
+    """
+    if len(rates) == 2:
+        leave = -np.diagonal(rates)
+        total = leave.sum()
+        share = leave / total if total > 0 else leave
+        gone = np.multiply.outer(-np.expm1(-total * dt), share)  # (..., 2): a e, b e
+        result = np.stack([1.0 - gone, gone], axis=-1)  # (..., 2, 2): stay, leave
+        result[..., 1, :] = result[..., 1, ::-1]
+        return result
+    result = np.maximum(exponential(rates * dt[..., None, None]), 0.0)
+    return np.asarray(result / result.sum(axis=-1, keepdims=True))
 
 
 def logarithm(trans: FloatArray, per: float) -> FloatArray | None:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from saltus.tracks.associate import Pairs, equal_codes, join_pairs, near_pairs
 from saltus.tracks.identity import conflicting
-from saltus.tracks.kinematics import Kinematics, Moments, Plan
+from saltus.tracks.kinematics import Kinematics, Plan
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
@@ -56,10 +56,12 @@ class Gate:
     def __call__(self, kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Index) -> Gated:
         """Pair tracks with the plots `index` of a slice inside their gates."""
         rows = life.rows()
-        near = self._coarse(kinematics.moments(rows), life, rows, m, index)
+        near = self._coarse(life, rows, m, index)
+        near = self._close(Pairs(rows[near.track], near.plot), life, m, index)
         if self._use_identity:
-            near = join_pairs(near, equal_codes(life.icao24[rows], m.icao24[index]))
-        near = self._admissible(Pairs(rows[near.track], near.plot), life, m, index)
+            same = equal_codes(life.icao24[rows], m.icao24[index])
+            near = join_pairs(near, Pairs(rows[same.track], same.plot))
+        near = self._admissible(near, life, m, index)
         dt = m.time[index[near.plot]] - life.time[near.track]
         offset = np.minimum(dt, 0.0)  # a plot of another source may come a little late
         copies = kinematics.predicted(near.track, np.maximum(dt, 0.0))
@@ -107,23 +109,41 @@ class Gate:
         R[at[fits]] = wide[row, best][fits]
         return R, fault
 
-    def _coarse(self, moments: Moments, life: Lifecycle, rows: _Index, m: Measurements, index: _Index) -> Pairs:
-        """Pair by a radius that no plot inside the gate can exceed."""
+    def _coarse(self, life: Lifecycle, rows: _Index, m: Measurements, index: _Index) -> Pairs:
+        """Pair by a radius about the position in mid-slice that no plot inside a gate can exceed."""
         middle, half = _span(m.time[index])
         dt = np.maximum(middle - life.time[rows], 0.0)
-        longest = dt + half
-        velocity, cov = moments.mean[:, _VELOCITY[:2]], moments.cov
-        position = moments.mean[:, _POSITION[:2]] + dt[:, None] * velocity
-        variance = cov[:, 0, 0] + cov[:, 2, 2] + longest**2 * (cov[:, 1, 1] + cov[:, 3, 3])
-        variance += 2.0 * longest * np.abs(cov[:, 0, 1] + cov[:, 2, 3])
-        variance += 0.5 * (self._accel * longest**2) ** 2
-        variance += float(np.trace(m.cov[index, :2, :2], axis1=1, axis2=2).max())
-        reach = np.sqrt(self.horizontal * variance) + np.hypot(velocity[:, 0], velocity[:, 1]) * half
-        far = np.hypot(m.ray[index, 0], m.ray[index, 1])
+        velocity = life.mean[rows][:, _VELOCITY[:2]]
+        position = life.mean[rows][:, _POSITION[:2]] + dt[:, None] * velocity
+        reach = self._reach(life, rows, dt + half, float(self._spread(m, index).max()))
+        reach = reach + np.where(life.status[rows] == CONFIRMED, float(self._astray(m, index).max()), 0.0)
+        return near_pairs(position, reach + np.hypot(velocity[:, 0], velocity[:, 1]) * half, m.position[index, :2])
+
+    def _close(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> Pairs:
+        """Keep the pairs that the same radius allows at the plot's own time."""
+        track, plot = pairs.track, index[pairs.plot]
+        dt = m.time[plot] - life.time[track]
+        position = life.mean[track][:, _POSITION[:2]] + dt[:, None] * life.mean[track][:, _VELOCITY[:2]]
+        reach = self._reach(life, track, np.abs(dt), self._spread(m, plot))
+        reach = reach + np.where(life.status[track] == CONFIRMED, self._astray(m, plot), 0.0)
+        keep = np.linalg.norm(m.position[plot, :2] - position, axis=-1) <= reach
+        return Pairs(track[keep], pairs.plot[keep])
+
+    def _reach(self, life: Lifecycle, rows: _Index, dt: _Array, plot_variance: float | _Array) -> _Array:
+        """Radius of the gate after dt, from the last state and the hardest manoeuvre since."""
+        cov = life.cov[rows]
+        variance = cov[:, 0, 0] + cov[:, 2, 2] + dt**2 * (cov[:, 1, 1] + cov[:, 3, 3])
+        variance += 2.0 * dt * np.abs(cov[:, 0, 1] + cov[:, 2, 3]) + 0.5 * (self._accel * dt**2) ** 2
+        return np.asarray(np.sqrt(self.horizontal * (variance + plot_variance)))
+
+    def _spread(self, m: Measurements, plot: _Index) -> _Array:
+        return np.asarray(m.cov[plot, 0, 0] + m.cov[plot, 1, 1])
+
+    def _astray(self, m: Measurements, plot: _Index) -> _Array:
+        """How far a faulty plot may lie."""
+        far = np.hypot(m.ray[plot, 0], m.ray[plot, 1])
         wrong = np.hypot(self._outlier_range, self._outlier_azimuth * far)
-        astray = np.sqrt(self.fault) * np.where(np.isnan(far), 1.5 * self._outlier_xy, wrong).max()
-        reach = reach + np.where(life.status[rows] == CONFIRMED, astray, 0.0)
-        return near_pairs(position, reach, m.position[index, :2])
+        return np.asarray(np.sqrt(self.fault) * np.where(np.isnan(far), 1.5 * self._outlier_xy, wrong))
 
     def _admissible(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> Pairs:
         """Drop pairs of contradicting addresses, and plots too old for the track."""

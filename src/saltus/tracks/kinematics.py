@@ -55,13 +55,9 @@ class Channel:
 
     axes: npt.NDArray[np.intp]
     chains: tuple[Chain, ...]
+    states: npt.NDArray[np.intp]  # positions of the channel's states among the six
     motion: Motion  # bound to the chains
     bank: Bank
-
-    @property
-    def states(self) -> npt.NDArray[np.intp]:
-        """Positions of the channel's states among the six."""
-        return np.stack([2 * self.axes, 2 * self.axes + 1], axis=-1).ravel()
 
     def belief(self, start: Start) -> Belief:
         """Give every mode the same Gaussian, and the chains their stationary law."""
@@ -183,7 +179,9 @@ def _chain(name: str, accel: tuple[float, ...], sojourn: tuple[float, ...]) -> C
 
 def _channel(axes: list[int], chains: tuple[Chain, ...], motion: Motion) -> Channel:
     bank = Bank(2 * len(axes), tuple(len(chain) for chain in chains))
-    return Channel(np.array(axes), chains, motion.bind(chains), bank)
+    position = 2 * np.array(axes)
+    states = np.stack([position, position + 1], axis=-1).ravel()
+    return Channel(np.array(axes), chains, states, motion.bind(chains), bank)
 
 
 def two_point_start(first: _Array, first_cov: _Array, second: _Array, second_cov: _Array, dt: _Array) -> Start:

@@ -27,7 +27,7 @@ class Birth(NamedTuple):
 
 
 class Lifecycle:
-    """Identity number, status, plot history and codes of every track; row numbers are the bank's."""
+    """Identity number, status, last state, plot history and codes of every track; row numbers are the bank's."""
 
     def __init__(self, settings: TrackerSettings) -> None:
         """Make an empty table."""
@@ -37,6 +37,8 @@ class Lifecycle:
         self.id = np.zeros(0, np.int64)
         self.status = np.zeros(0, np.int8)
         self.time = np.zeros(0)  # of the last update, s
+        self.mean = np.zeros((0, 6))  # state then: x, vx, y, vy, z, vz in the plane
+        self.cov = np.zeros((0, 6, 6))
         self.period = np.zeros(0)  # shortest update period of the sources that saw the track, s
         self.history = np.zeros(0, np.uint64)  # bit k: a plot k expected scans ago
         self.coasted = np.zeros(0, np.int64)  # coasted rows published since the last update
@@ -109,6 +111,6 @@ class Lifecycle:
         grown = max(size, 2 * old, 64)
         for name, column in vars(self).items():
             if isinstance(column, np.ndarray):
-                bigger = np.zeros(grown, column.dtype)
+                bigger = np.zeros((grown, *column.shape[1:]), column.dtype)
                 bigger[:old] = column
                 setattr(self, name, bigger)

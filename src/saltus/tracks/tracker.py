@@ -19,8 +19,10 @@ __all__ = ["Assignments", "Rows", "Tracker", "join_rows"]
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
-_SLICE = 0.4  # of the shortest update period: a target gives a source at most one plot in a slice
-_LONGEST_SLICE = 2.0  # s
+# A target gives a source at most one plot in a slice of this share of the shortest update period: a rotating radar
+# keeps its period, other systems report more often now and then.
+_SLICE_ROTATING, _SLICE_OTHER = 0.9, 0.4
+_LONGEST_SLICE = 4.0  # s
 _HEIGHT_SPAN = 15_000.0  # m: heights of clutter and new targets spread over this
 _CLIMB = 15.0  # m/s: standard deviation of the vertical speed of a new track
 _STANDING = np.array([-4.0, -2.0, 0.0])  # nats: a plot is less likely a seed's or a tentative track's own
@@ -123,7 +125,8 @@ class Tracker:
         for begin, end in self._slices():
             self._housekeep(float(measurements.time[begin]))
             sources = measurements.source[begin:end]
-            for s in np.unique(sources):
+            _, first = np.unique(sources, return_index=True)
+            for s in sources[np.sort(first)]:  # as they come, whatever number each has
                 self._scan(begin + np.flatnonzero(sources == s), float(self._periods[s]))
             if progress is not None:
                 progress(end / len(measurements))
@@ -132,8 +135,10 @@ class Tracker:
 
     def _slices(self) -> Iterator[tuple[int, int]]:
         time = self._m.time
-        used = np.unique(self._m.source)
-        width = min(_LONGEST_SLICE, _SLICE * float(self._periods[used].min())) if len(used) else 1.0
+        used, first = np.unique(self._m.source, return_index=True)
+        rotating = np.isfinite(self._m.ray[first, 0])
+        share = _SLICE_ROTATING if len(used) == 1 and rotating.all() else _SLICE_OTHER
+        width = min(_LONGEST_SLICE, share * float(self._periods[used].min())) if len(used) else 1.0
         begin = 0
         while begin < len(time):
             end = int(np.searchsorted(time, time[begin] + width, side="right"))
@@ -220,6 +225,7 @@ class Tracker:
         cov[:, 5, 5] = _CLIMB**2
         rows = self._kinematics.add(Start(mean, cov))
         life.begin(rows, Birth(m.time[plots], np.full(len(plots), period), plots))
+        life.mean[rows], life.cov[rows] = mean, cov
         life.has_altitude[rows] = np.isfinite(m.position[plots, 2])
         self._note_codes(rows, plots)
         self._track_id[plots] = life.id[rows]
@@ -234,6 +240,7 @@ class Tracker:
     def _publish(self, rows: _Index, plots: _Index, centre: _Array, gate_cov: _Array, d2: _Array) -> None:
         if len(rows):
             life, moments = self._life, self._kinematics.moments(rows)
+            life.mean[rows], life.cov[rows] = moments.mean, moments.cov
             codes = life.icao24[rows], life.mode3a[rows], life.named[rows]
             self._emit(
                 Rows(
