@@ -1,0 +1,210 @@
+"""The program on the command line: versions, help, and one clear line for what cannot be."""
+
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from saltus.cli import main
+from saltus.io.asterix_write import write_cat048
+
+PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+SITE = "[[sensor]]\nsac = 25\nsic = 1\nlatitude = 48.0\nlongitude = 11.0\nheight = 500.0\n"
+
+
+def saltus(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def refused(*arguments, status=2):
+    """The one line said by a command that fails; it must be no traceback and end the program as expected."""
+    result = saltus(*arguments)
+    assert result.exit_code == status, result.output
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("saltus: ")
+    assert "Traceback" not in lines[0]
+    return lines[0]
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Ten scans of one target, 50 km away; returns the file and a configuration with its site."""
+    path, config = tmp_path / "radar.ast", tmp_path / "sensors.toml"
+    time = 36000.0 + 4.0 * np.arange(10)
+    write_cat048(
+        path,
+        sac=25,
+        sic=1,
+        time_of_day=time,
+        range_m=50e3 + 200.0 * (time - time[0]),
+        azimuth_rad=np.full(10, 1.0),
+        altitude_m=np.full(10, 9144.0),
+        north_marker_times=time - 0.6,
+    )
+    config.write_text("date = 2025-06-01\n" + SITE)
+    return path, config
+
+
+def test_version_is_the_projects():
+    result = saltus("--version")
+    assert result.exit_code == 0
+    assert result.output.split() == ["saltus,", "version", PROJECT["version"]]
+
+
+def test_help_names_every_command():
+    for flag in ("--help", "-h"):
+        result = saltus(flag)
+        assert result.exit_code == 0
+        for command in ("track", "info", "study", "demo"):
+            assert f"  {command}" in result.output
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("track", ["-o", "--config", "--date", "--identity", "--from", "--to", "--no-report"]),
+        ("info", ["--config", "--date"]),
+        ("study", ["-o", "--runs", "--seed"]),
+        ("demo", ["-o", "--seed"]),
+    ],
+)
+def test_help_of_each_command_names_its_options(command, options):
+    result = saltus(command, "--help")
+    assert result.exit_code == 0
+    for option in options:
+        assert option in result.output
+
+
+def test_the_version_needs_none_of_the_heavy_libraries():
+    """In a process of its own, since this one has imported everything."""
+    code = (
+        "import sys; from saltus.cli import main\n"
+        "try: main(['--version'])\n"
+        "except SystemExit as end: assert not end.code\n"
+        "print(sorted({'numpy', 'scipy', 'pyarrow', 'asterix', 'matplotlib', 'rich', 'pydantic'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_the_installed_script_is_this_program():
+    script = Path(sys.executable).with_name("saltus")
+    done = subprocess.run([script, "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == PROJECT["version"]
+
+
+def test_an_unknown_study_is_refused_with_the_known_ones(tmp_path):
+    line = refused("study", "no-such-study", "-o", tmp_path / "out")
+    assert "no-such-study" in line
+    assert "radar" in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("arguments", ["track", "track x.ast", "no-such-command", "info", "study radar"])
+def test_a_command_line_that_lacks_something_says_how_to_use_it(arguments):
+    result = saltus(*arguments.split())
+    assert result.exit_code == 2
+    assert "Usage:" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    line = refused("track", tmp_path / "absent.ast", "-o", tmp_path / "out")
+    assert "absent.ast" in line
+    assert not (tmp_path / "out").exists()
+    assert "absent.toml" in refused(
+        "track", tmp_path / "a.ast", "-o", tmp_path / "o", "--config", tmp_path / "absent.toml"
+    )
+
+
+def test_an_empty_file(tmp_path):
+    (tmp_path / "empty.ast").write_bytes(b"")
+    line = refused("track", tmp_path / "empty.ast", "-o", tmp_path / "out")
+    assert "empty.ast" in line
+    assert "empty" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_garbage(tmp_path):
+    noise = np.random.default_rng(1).integers(0, 256, 5000).astype(np.uint8).tobytes()
+    for name in ("noise.ast", "noise.pcap", "noise.csv", "noise.parquet", "noise.xyz", "noise"):
+        (tmp_path / name).write_bytes(noise)
+        assert name in refused("track", tmp_path / name, "-o", tmp_path / "out")
+        assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_format_lists_the_known_ones(tmp_path):
+    (tmp_path / "tracks.xlsx").write_bytes(b"PK\x03\x04" + bytes(100))
+    line = refused("track", tmp_path / "tracks.xlsx", "-o", tmp_path / "out")
+    for known in ("tracks.xlsx", ".ast", ".pcap", ".csv", ".parquet"):
+        assert known in line
+
+
+def test_an_output_directory_that_is_a_file(recording, tmp_path):
+    path, config = recording
+    (tmp_path / "out").write_text("mine")
+    assert "out" in refused("track", path, "-o", tmp_path / "out", "--config", config)
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_a_site_that_is_missing_is_named_with_what_to_write(recording, tmp_path):
+    path, _ = recording
+    line = refused("track", path, "-o", tmp_path / "out", "--date", "2025-06-01")
+    for word in ("25/1", "[[sensor]]", "sac = 25", "sic = 1", "latitude", "longitude", "height", "--config"):
+        assert word in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--date", "2025-13-01"], ["2025-13-01", "YYYY-MM-DD"]),
+        (["--date", "yesterday"], ["yesterday", "YYYY-MM-DD"]),
+        (["--from", "half past ten"], ["half past ten", "HH:MM"]),
+        (["--to", "25:00"], ["25:00", "HH:MM"]),
+        (["--from", "12:00"], ["outside time window"]),  # after the recording's end
+        (["--from", "10:00:30", "--to", "10:00:10"], ["outside time window"]),
+    ],
+)
+def test_times_and_dates_that_cannot_be(recording, tmp_path, arguments, words):
+    path, config = recording
+    line = refused("track", path, "-o", tmp_path / "out", "--config", config, *arguments)
+    for word in words:
+        assert word in line
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (SITE.replace("latitude", "lattitude"), ["lattitude", "latitude"]),
+        (SITE.replace("48.0", "480.0"), ["latitude", "480"]),
+        ("[tracker]\ngate_probability = 1.5\n", ["gate_probability", "1.5"]),
+        ('[filter]\nform = "spherical"\n', ["form", "spherical"]),
+        ("[[sensor]\n", ["TOML"]),
+    ],
+)
+def test_configurations_that_cannot_be(recording, tmp_path, content, words):
+    path, _ = recording
+    config = tmp_path / "wrong.toml"
+    config.write_text(content)
+    line = refused("track", path, "-o", tmp_path / "out", "--config", config)
+    for word in ("wrong.toml", *words):
+        assert word in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_track_says_what_it_did(recording, tmp_path):
+    path, config = recording
+    result = saltus("track", path, "-o", tmp_path / "out", "--config", config, "--no-report")
+    assert result.exit_code == 0, result.output
+    assert "10 reports read, 10 on 1 confirmed tracks" in result.stdout
+    assert str(tmp_path / "out") in result.stdout
+    assert result.stderr == ""
