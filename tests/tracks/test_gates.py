@@ -1,5 +1,7 @@
 """Gates: what they promise in simulation, which pairs they form, and what becomes of heights and faulty plots."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -8,7 +10,6 @@ from tracking_scenes import measured
 from saltus.tracks.gates import Gate
 from saltus.tracks.kinematics import Start, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, TENTATIVE, Birth, Lifecycle
-from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
 DT = 4.0
@@ -21,8 +22,9 @@ def tracks(filters, mean, status=TENTATIVE, time=0.0, icao24=-1):
     """Kinematics and lifecycle with one track per row of `mean`, last updated at `time`."""
     k = len(mean)
     kinematics, life = make_kinematics(filters), Lifecycle(TrackerSettings())
-    rows = kinematics.add(Start(mean, np.broadcast_to(COV, (k, 6, 6))))
-    life.begin(rows, Birth(np.full(k, time), np.full(k, DT), np.zeros(k, int)))
+    cov = np.broadcast_to(COV, (k, 6, 6))
+    rows = kinematics.add(Start(mean, cov))
+    life.begin(rows, Birth(np.full(k, time), np.full(k, DT), np.zeros(k, int), mean, cov))
     life.status[rows], life.icao24[rows] = status, icao24
     return kinematics, life, rows
 
@@ -148,7 +150,7 @@ def polar(m, site_xy):
     """Let the plots come from a radar at a place of the plane."""
     ray = m.position[:, :2] - site_xy
     range_azimuth = np.stack([np.hypot(*ray.T), np.arctan2(ray[:, 0], ray[:, 1])], axis=-1)
-    return Measurements(**{**m._asdict(), "ray": ray, "polar": range_azimuth})
+    return replace(m, ray=ray, polar=range_azimuth)
 
 
 @pytest.mark.parametrize(("shift", "kind"), [((0.0, 1500.0), 1), ((1200.0, 0.0), 2)])

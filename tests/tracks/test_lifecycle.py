@@ -10,9 +10,13 @@ from saltus.tracks.settings import TrackerSettings
 PERIOD = 4.0
 
 
+def _birth(k, time):
+    return Birth(np.full(k, time), np.full(k, PERIOD), np.arange(k), np.zeros((k, 6)), np.zeros((k, 6, 6)))
+
+
 def born(life, rows, time=0.0):
     rows = np.asarray(rows)
-    life.begin(rows, Birth(np.full(len(rows), time), np.full(len(rows), PERIOD), np.arange(len(rows))))
+    life.begin(rows, _birth(len(rows), time))
 
 
 def hit(life, rows, time):

@@ -19,11 +19,13 @@ _SLACK = 0.6  # of a period: how late a plot may come before it counts as missed
 
 
 class Birth(NamedTuple):
-    """What a new track takes over from its first plot."""
+    """What new tracks take over from their first plots."""
 
-    time: _Array
-    period: _Array
-    plot: npt.NDArray[np.intp]
+    time: _Array  # (k,), s
+    period: _Array  # (k,), s
+    plot: npt.NDArray[np.intp]  # (k,)
+    mean: _Array  # (k, 6)
+    cov: _Array  # (k, 6, 6)
 
 
 class Lifecycle:
@@ -59,7 +61,8 @@ class Lifecycle:
         self.id[rows] = self._next_id + np.arange(len(rows))
         self._next_id += len(rows)
         self.status[rows] = SEED
-        self.time[rows], self.period[rows], self.plot[rows] = birth
+        self.time[rows], self.period[rows], self.plot[rows] = birth[:3]
+        self.mean[rows], self.cov[rows] = birth[3:]
         self.history[rows] = 1
         self.coasted[rows] = 0
         self.has_altitude[rows] = False

@@ -224,8 +224,7 @@ class Tracker:
         cov[:, [1, 3], [1, 3]] = self._seed_speed**2
         cov[:, 5, 5] = _CLIMB**2
         rows = self._kinematics.add(Start(mean, cov))
-        life.begin(rows, Birth(m.time[plots], np.full(len(plots), period), plots))
-        life.mean[rows], life.cov[rows] = mean, cov
+        life.begin(rows, Birth(m.time[plots], np.full(len(plots), period), plots, mean, cov))
         life.has_altitude[rows] = np.isfinite(m.position[plots, 2])
         self._note_codes(rows, plots)
         self._track_id[plots] = life.id[rows]
