@@ -16,6 +16,7 @@ _EXPORTS = {
     "Record": "saltus.filters",
     "constant_acceleration": "saltus.models",
     "constant_velocity": "saltus.models",
+    "decide": "saltus.decisions",
     "singer": "saltus.models",
     "LinearSensor": "saltus.models",
     "ModelError": "saltus.errors",

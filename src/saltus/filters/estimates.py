@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from jaxtyping import Float
 
+from saltus.decisions import Decision, decide
 from saltus.errors import ModelError
 
 __all__ = ["Estimates"]
@@ -45,24 +47,46 @@ class Estimates:
     chains: tuple[str, ...] = ()
     times: Float[np.ndarray, " t"] | None = None
 
-    def prob(self, chain: str | int) -> Float[np.ndarray, "*rows m"]:
-        """Return the marginal probabilities of one chain, (*batch, T, M).
+    def prob(self, *chains: str | int) -> Float[np.ndarray, "*rows_m"]:
+        """Return the marginal probabilities of one chain, (*batch, T, M), or the joint ones of several.
 
         Args:
-            chain: its name, or its position among the chains.
+            chains: names, or positions among the chains; the axes of the result come in the order asked for.
 
         Raises:
-            ModelError: no chain of that name.
+            ModelError: no chain of that name, no chain at all, or one chain twice.
         """
-        n_chains = self.probs.ndim - self.mean.ndim + 1
+        asked = [self._position(chain) for chain in chains]
+        if not asked or len(set(asked)) < len(asked):
+            raise ModelError(f"prob needs the name or position of each chain wanted, once; got {chains}.")
+        first = self.mean.ndim - 1
+        others = tuple(first + c for c in range(self._n_chains) if c not in asked)
+        kept = sorted(asked)
+        summed = self.probs.sum(axis=others)
+        return np.asarray(np.moveaxis(summed, [first + kept.index(c) for c in asked], range(first, summed.ndim)))
+
+    def decide(
+        self, *, alpha: npt.ArrayLike = 1.0, beta: npt.ArrayLike = 0.0, scale: npt.ArrayLike | None = None
+    ) -> Decision:
+        """Decide on a mode and an estimate for every row: see `saltus.decide`.
+
+        Raises:
+            ModelError: the modes' means and covariances were not kept, or an argument does not fit.
+        """
+        if self.mode_means is None or self.mode_covs is None:
+            raise ModelError("a decision needs the mean and covariance of every mode: filter with per_mode=True.")
+        modes = (self.probs, self.mode_means, self.mode_covs)
+        return decide(*modes, alpha=alpha, beta=beta, scale=scale, n_chains=self._n_chains)
+
+    @property
+    def _n_chains(self) -> int:
+        return self.probs.ndim - self.mean.ndim + 1
+
+    def _position(self, chain: str | int) -> int:
         if isinstance(chain, str):
             if chain not in self.chains:
                 raise ModelError(f"no chain named {chain!r}; the chains are {', '.join(self.chains) or 'unnamed'}.")
-            index = self.chains.index(chain)
-        else:
-            index = chain
-        if not 0 <= index < n_chains:
-            raise ModelError(f"chain {index} does not exist: there are {n_chains}, counted from 0.")
-        first = self.mean.ndim - 1
-        others = tuple(first + c for c in range(n_chains) if c != index)
-        return np.asarray(self.probs.sum(axis=others))
+            return self.chains.index(chain)
+        if not 0 <= chain < self._n_chains:
+            raise ModelError(f"chain {chain} does not exist: there are {self._n_chains}, counted from 0.")
+        return chain
