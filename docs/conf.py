@@ -3,13 +3,18 @@
 import dataclasses
 import importlib
 import re
+import sys
 from importlib.metadata import version as distribution_version
+from pathlib import Path
 
 from docutils import nodes
 from docutils.parsers.rst import Directive
 from docutils.utils.math import latex2mathml
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
+
+sys.path.insert(0, str(Path(__file__).parent))
+import house
 
 project = "Saltus"
 author = "The Saltus authors"
@@ -156,6 +161,14 @@ class NameTable(Directive):
         return [listed]
 
 
+class House(Directive):
+    """The drawing of the one-way house."""
+
+    def run(self) -> list[nodes.Node]:
+        """Put it on the page."""
+        return [nodes.raw("", house.draw(), format="html")]
+
+
 def as_markup(app, what, name, obj, options, lines):
     """Let docstrings be plain text: equations full of * and | are no markup, `code` is literal."""
     del app, what, name, obj, options
@@ -196,6 +209,7 @@ def setup(app: Sphinx) -> dict[str, object]:
     """Connect everything to Sphinx."""
     app.add_html_math_renderer("mathml", (visit_math, None), (visit_displaymath, None))
     app.add_directive("settings-table", SettingsTable)
+    app.add_directive("house", House)
     app.add_directive("public-names", NameTable)
     app.connect("autodoc-process-docstring", as_markup, priority=300)
     app.connect("autodoc-process-signature", as_signature)
