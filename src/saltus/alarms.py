@@ -89,9 +89,9 @@ def shiryaev(llr: npt.ArrayLike, *, begin: float, end: float = 0.0, prior: float
     Source: Shiryaev (1963), with an end: the two-state filter of a hidden Markov chain.
     """
     ratio = _levels("llr", llr)
-    for name, p in (("begin", begin), ("end", end), ("prior", prior)):
-        if not 0 <= p <= 1:
-            raise ModelError(f"{name} must be a probability, got {p}.")
+    for name, value in (("begin", begin), ("end", end), ("prior", prior)):
+        if not 0 <= value <= 1:
+            raise ModelError(f"{name} must be a probability, got {value}.")
     p, out = np.full(ratio.shape[:-1], prior), np.empty_like(ratio)
     with np.errstate(divide="ignore"):
         for k in range(ratio.shape[-1]):
