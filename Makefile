@@ -3,9 +3,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+NATIVE := CMakeLists.txt $(wildcard native/*)
 DOCS_READY := $(VENV)/.docs-ready
 
-.PHONY: demo test check format docs wheel clean
+.PHONY: demo test check format docs wheel bench sanitize clean
 
 demo: $(READY)
 	$(BIN)/saltus demo -o out/demo
@@ -27,10 +28,29 @@ docs: $(DOCS_READY)
 	$(BIN)/python -m sphinx -W -q -b html docs build/docs
 	@echo "docs: build/docs/index.html"
 
+# The wheel is built from the sdist, so a file missing there is noticed.
 wheel: $(READY)
 	$(BIN)/python -m build --outdir dist
 
-$(READY): pyproject.toml
+# The peers that the benchmark compares with live in their own environment.
+bench:
+	$(PYTHON) -m venv build/bench
+	build/bench/bin/python -m pip install -q --upgrade pip
+	build/bench/bin/python -m pip install -q '.[bench]'
+	build/bench/bin/python benchmarks/filter_speed.py -o benchmarks/results.json
+
+# The compiled kernel under the address and undefined-behaviour sanitizers, in an environment that borrows the tools
+# of .venv. Python itself leaks at exit, so leaks are not looked for.
+sanitize: $(READY)
+	$(PYTHON) -m venv build/sanitize
+	SALTUS_REQUIRE_NATIVE=1 build/sanitize/bin/python -m pip install -q --no-deps --force-reinstall . \
+	  -C cmake.define.SALTUS_SANITIZE=ON -C build-dir=build/sanitize/cmake
+	LD_PRELOAD="$$($${CXX:-g++} -print-file-name=libasan.so) $$($${CXX:-g++} -print-file-name=libstdc++.so)" \
+	  ASAN_OPTIONS=detect_leaks=0 SALTUS_REQUIRE_NATIVE=1 \
+	  PYTHONPATH="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" \
+	  build/sanitize/bin/python -m pytest tests/native tests/filters
+
+$(READY): pyproject.toml $(NATIVE)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -q --upgrade pip
 	$(BIN)/python -m pip install -q -e '.[dev]'

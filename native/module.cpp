@@ -21,7 +21,7 @@ namespace {
 
 using saltus::Kernel, saltus::Model;
 using Array = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-using Index = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Index = nb::ndarray<const std::int64_t, nb::ndim<1>, nb::device::cpu>;  // any stride, no other type
 using Out = nb::ndarray<double, nb::c_contig, nb::device::cpu>;
 using Size = std::ptrdiff_t;
 
@@ -116,11 +116,17 @@ class Modes {
   long count_ = 1;
 };
 
+std::vector<std::int64_t> numbers(const Index& index) {
+  std::vector<std::int64_t> out(index.shape(0));
+  for (std::size_t i = 0; i < out.size(); ++i) out[i] = index(i);
+  return out;
+}
+
 // Owns what a Model points to.
 struct Held {
   Model model;
   Array array;
-  Index rows;
+  std::vector<std::int64_t> rows;
   std::vector<int> which;
 };
 
@@ -136,8 +142,8 @@ void read(Held& held, const char* name, nb::handle value, const Reading& as, con
   nb::handle given = value;
   if (nb::isinstance<nb::tuple>(value)) {  // with the row of every track
     given = value[0].ptr();
-    held.rows = nb::cast<Index>(value[1]);
-    require(Size(held.rows.shape(0)) == as.tracks, std::string(name) + ": one row number per track is needed.");
+    held.rows = numbers(nb::cast<Index>(value[1], false));
+    require(Size(held.rows.size()) == as.tracks, std::string(name) + ": one row number per track is needed.");
   }
   held.array = nb::cast<Array>(given);
   const Array& a = held.array;
@@ -149,7 +155,7 @@ void read(Held& held, const char* name, nb::handle value, const Reading& as, con
   for (std::size_t i = 0; fits && i < core.size(); ++i) fits = shape[lead + chains + i] == core[i];
   for (int c = 0; fits && c < chains; ++c)
     fits = shape[lead + c] == 1 || shape[lead + c] == as.modes.sizes()[c];
-  fits = fits && (held.rows.is_valid() || shape[0] == 1 || shape[0] == as.tracks);
+  fits = fits && (!held.rows.empty() || shape[0] == 1 || shape[0] == as.tracks);
   fits = fits && (!as.timed || shape[1] == 1 || shape[1] == as.steps);
   require(fits, std::string(name) + " has shape " + shape_of(a) +
                     ", which does not fit the chains, rows and sizes it is used with.");
@@ -159,11 +165,9 @@ void read(Held& held, const char* name, nb::handle value, const Reading& as, con
   const Size per_step = Size(model.distinct) * model.core;
   model.time = as.timed && shape[1] > 1 ? per_step : 0;
   model.row = shape[0] > 1 ? per_step * (as.timed ? shape[1] : 1) : 0;
-  if (held.rows.is_valid()) {
-    model.rows = held.rows.data();
-    for (Size i = 0; i < as.tracks; ++i)
-      require(model.rows[i] >= 0 && model.rows[i] < shape[0], std::string(name) + ": a row number is out of range.");
-  }
+  for (std::int64_t row : held.rows)
+    require(row >= 0 && row < shape[0], std::string(name) + ": a row number is out of range.");
+  model.rows = held.rows.empty() ? nullptr : held.rows.data();
   held.which = as.modes.table({shape.begin() + lead, shape.begin() + lead + chains});
   model.which = held.which.data();
   model.data = a.data();
@@ -258,7 +262,7 @@ int imm_filter(const std::string& isa, const Array& z, const nb::dict& model, co
   return run_threads(kernel, p, threads);
 }
 
-// Beliefs in lanes. The rows in use are the caller's affair; row numbers are checked here.
+// Beliefs in lanes. Which rows are in use, hence hold anything, is the caller's affair; row numbers are checked here.
 class Bank {
  public:
   Bank(const std::string& isa, int n, const std::vector<int>& sizes, Size capacity)
@@ -274,14 +278,14 @@ class Bank {
     if (blocks <= old && data_) return;
     Workspace data = allocate(size * blocks);
     if (data_) std::memcpy(data.get(), data_.get(), size * old * sizeof(double));
-    std::fill(data.get() + size * old, data.get() + size * blocks, 0.0);
     data_ = std::move(data);
     blocks_ = blocks;
     tracks_.data = data_.get();
   }
 
   void step(const Index& index, const nb::sequence& trans, nb::handle F, nb::handle b, nb::handle Q) {
-    const saltus::Rows rows = checked(index);
+    const std::vector<std::int64_t> held_rows = checked(index);
+    const saltus::Rows rows{held_rows.data(), Size(held_rows.size())};
     const Reading as{modes_, rows.count, 1, false};
     const Size n = tracks_.n;
     Held f, u, q;
@@ -296,7 +300,8 @@ class Bank {
 
   int measure(const Index& index, bool write, const Array& z, nb::handle H, nb::handle d, nb::handle R, const Out& d2,
               const Out& log_likelihood) {
-    const saltus::Rows rows = checked(index);
+    const std::vector<std::int64_t> held_rows = checked(index);
+    const saltus::Rows rows{held_rows.data(), Size(held_rows.size())};
     const Reading as{modes_, rows.count, 1, false};
     require(z.ndim() == 2 && Size(z.shape(0)) == rows.count,
             "z has shape " + shape_of(z) + "; it is (k, m) with one measurement per row addressed.");
@@ -312,21 +317,24 @@ class Bank {
   }
 
   void moments(const Index& index, nb::handle mean, nb::handle cov, nb::handle probs) {
-    const saltus::Rows rows = checked(index);
+    const std::vector<std::int64_t> held_rows = checked(index);
+    const saltus::Rows rows{held_rows.data(), Size(held_rows.size())};
     const std::size_t n = tracks_.n, k = rows.count;
     kernel_.bank_moments(tracks_, rows, output(mean, k * n, "mean"), output(cov, k * n * n, "cov"),
                          output(probs, k * tracks_.modes, "probs"), space(1));
   }
 
   void read_rows(const Index& index, nb::handle log_probs, nb::handle means, nb::handle covs) {
-    const saltus::Rows rows = checked(index);
+    const std::vector<std::int64_t> held_rows = checked(index);
+    const saltus::Rows rows{held_rows.data(), Size(held_rows.size())};
     const std::size_t n = tracks_.n, k = std::size_t(rows.count) * tracks_.modes;
     kernel_.bank_read(tracks_, rows, output(log_probs, k, "log_probs"), output(means, k * n, "means"),
                       output(covs, k * n * n, "covs"), space(1));
   }
 
   void write_rows(const Index& index, const Array& log_probs, const Array& means, const Array& covs) {
-    const saltus::Rows rows = checked(index);
+    const std::vector<std::int64_t> held_rows = checked(index);
+    const saltus::Rows rows{held_rows.data(), Size(held_rows.size())};
     const std::size_t n = tracks_.n, k = std::size_t(rows.count) * tracks_.modes;
     require(log_probs.size() == k && means.size() == k * n && covs.size() == k * n * n,
             "a belief of this bank has log_probs (k, M1, ..., MC), means (..., n), covs (..., n, n); got " +
@@ -335,20 +343,20 @@ class Bank {
   }
 
   void copy_from(const Index& target, const Bank& other, const Index& source) {
-    const saltus::Rows to = checked(target), from = other.checked(source);
-    require(tracks_.n == other.tracks_.n && tracks_.modes == other.tracks_.modes && to.count == from.count &&
+    const std::vector<std::int64_t> to = checked(target), from = other.checked(source);
+    require(tracks_.n == other.tracks_.n && tracks_.modes == other.tracks_.modes && to.size() == from.size() &&
                 &kernel_ == &other.kernel_,
             "rows are copied between banks of the same n, chains and instruction set, as many as there are.");
-    kernel_.bank_copy(other.tracks_, from, tracks_, to);
+    kernel_.bank_copy(other.tracks_, {from.data(), Size(from.size())}, tracks_, {to.data(), Size(to.size())});
   }
 
  private:
-  saltus::Rows checked(const Index& index) const {
-    const Size count = index.shape(0), capacity = blocks_ * kernel_.lanes;
-    for (Size i = 0; i < count; ++i)
-      if (index(i) < 0 || index(i) >= capacity)
-        throw nb::index_error(("row " + std::to_string(index(i)) + " is not in this bank.").c_str());
-    return {index.data(), count};
+  std::vector<std::int64_t> checked(const Index& index) const {
+    std::vector<std::int64_t> rows = numbers(index);
+    for (std::int64_t row : rows)
+      if (row < 0 || row >= blocks_ * kernel_.lanes)
+        throw nb::index_error(("row " + std::to_string(row) + " is not in this bank.").c_str());
+    return rows;
   }
 
   // Grows with the largest measurement seen, and serves every call.
@@ -377,14 +385,15 @@ NB_MODULE(_native, module) {
   module.def("lanes", [](const std::string& isa) { return kernel_of(isa).lanes; });
   module.def("imm_filter", &imm_filter, nb::arg("isa"), nb::arg("z"), nb::arg("model"), nb::arg("out"),
              nb::arg("every"), nb::arg("threads"));
+  const auto rows = nb::arg().noconvert();
   nb::class_<Bank>(module, "Bank")
       .def(nb::init<const std::string&, int, const std::vector<int>&, Size>())
       .def("grow", &Bank::grow)
-      .def("step", &Bank::step, nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg())
-      .def("measure", &Bank::measure, nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg(),
+      .def("step", &Bank::step, rows, nb::arg(), nb::arg(), nb::arg().none(), nb::arg())
+      .def("measure", &Bank::measure, rows, nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg(),
            nb::arg().noconvert(), nb::arg().noconvert())
-      .def("moments", &Bank::moments)
-      .def("read", &Bank::read_rows)
-      .def("write", &Bank::write_rows)
-      .def("copy_from", &Bank::copy_from);
+      .def("moments", &Bank::moments, rows, nb::arg(), nb::arg(), nb::arg())
+      .def("read", &Bank::read_rows, rows, nb::arg(), nb::arg(), nb::arg())
+      .def("write", &Bank::write_rows, rows, nb::arg(), nb::arg(), nb::arg())
+      .def("copy_from", &Bank::copy_from, rows, nb::arg(), rows);
 }

@@ -8,10 +8,20 @@ from typing import Literal
 
 from saltus.errors import ModelError
 
-__all__ = ["Backend", "instruction_set", "native_module", "system_report", "thread_count", "use_native"]
+__all__ = [
+    "MOST_MODES",
+    "MOST_STATES",
+    "Backend",
+    "instruction_set",
+    "native_module",
+    "system_report",
+    "thread_count",
+    "use_native",
+]
 
 Backend = Literal["numpy", "native"]
 
+MOST_STATES, MOST_MODES = 256, 65536  # limits of the compiled kernel; states, and measured components
 _THREAD_WORK = 2e7  # multiply-adds below which starting a thread costs more than it saves
 
 
@@ -77,13 +87,8 @@ def thread_count(num_threads: int | None, work: float) -> int:
     Args:
         num_threads: what the caller asked for.
         work: multiply-adds to do.
-
-    Raises:
-        ModelError: num_threads is not at least 1.
     """
     if num_threads is not None:
-        if num_threads < 1:
-            raise ModelError(f"num_threads is at least 1, not {num_threads}.")
         return int(num_threads)
     if work < _THREAD_WORK:
         return 1

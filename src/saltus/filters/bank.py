@@ -1,6 +1,8 @@
 """Many multimode filters at once: rows that are added, stepped, scored, updated and removed as arrays."""
 
 from collections.abc import Sequence
+from copy import copy
+from math import prod
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -9,7 +11,7 @@ from jaxtyping import Float, Int
 
 from saltus.errors import ModelError
 from saltus.filters import steps
-from saltus.filters.backend import Backend, use_native
+from saltus.filters.backend import MOST_MODES, MOST_STATES, Backend, use_native
 from saltus.filters.steps import Belief
 
 __all__ = ["Bank", "NumpyStore"]
@@ -71,9 +73,8 @@ class Bank:
 
     def take(self, rows: _Rows) -> "Bank":
         """Return a new bank whose rows 0..k-1 are copies of `rows` (repeats allowed: hypotheses, resampling)."""
-        bank = Bank(self.n, self.sizes, len(rows), self.backend)
-        bank._free.clear()
-        bank._store.copy_from(np.arange(len(rows)), self._store, rows)
+        bank = copy(self)
+        bank._store, bank._capacity, bank._free = self._store.take(rows), len(rows), []
         return bank
 
     def put(self, rows: _Rows, other: "Bank", other_rows: _Rows) -> None:
@@ -126,6 +127,7 @@ class _Store(Protocol):
     def grow(self, capacity: int) -> None: ...
     def read(self, rows: _Rows) -> Belief: ...
     def write(self, rows: _Rows, belief: Belief) -> None: ...
+    def take(self, rows: _Rows) -> "_Store": ...
     def copy_from(self, rows: _Rows, other: Any, other_rows: _Rows) -> None: ...
     def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None: ...
     def measure(
@@ -135,7 +137,8 @@ class _Store(Protocol):
 
 
 def _make_store(n: int, sizes: tuple[int, ...], capacity: int, backend: Backend | None) -> _Store:
-    if use_native(backend):
+    fits = n <= MOST_STATES and prod(sizes) <= MOST_MODES
+    if use_native(backend) and (backend == "native" or fits):
         from saltus.filters.native import NativeStore
 
         return NativeStore(n, sizes, capacity)
@@ -147,7 +150,7 @@ class NumpyStore:
 
     def __init__(self, n: int, sizes: tuple[int, ...], capacity: int) -> None:
         """Make room for `capacity` rows."""
-        self._n_chains = len(sizes)
+        self._sizes, self._n_chains = sizes, len(sizes)
         self._log_probs = np.zeros((capacity, *sizes))
         self._means = np.zeros((capacity, *sizes, n))
         self._covs = np.zeros((capacity, *sizes, n, n))
@@ -165,6 +168,12 @@ class NumpyStore:
     def write(self, rows: _Rows, belief: Belief) -> None:
         """Overwrite rows."""
         self._log_probs[rows], self._means[rows], self._covs[rows] = belief
+
+    def take(self, rows: _Rows) -> "NumpyStore":
+        """Return a store whose rows 0..k-1 are copies of `rows`."""
+        store = NumpyStore(self._means.shape[-1], self._sizes, 0)
+        store._log_probs, store._means, store._covs = self.read(rows)
+        return store
 
     def copy_from(self, rows: _Rows, other: "NumpyStore", other_rows: _Rows) -> None:
         """Overwrite rows with those of another store."""

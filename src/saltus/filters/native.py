@@ -114,13 +114,13 @@ def _by_run(a: _Array, batch: tuple[int, ...]) -> _Array | tuple[_Array, npt.NDA
 class NativeStore:
     """The beliefs of a Bank in the lanes of the compiled kernel: the twin of `bank.NumpyStore`."""
 
-    def __init__(self, n: int, sizes: tuple[int, ...], capacity: int) -> None:
-        """Make room for `capacity` rows."""
+    def __init__(self, n: int, sizes: tuple[int, ...], capacity: int, isa: str = "") -> None:
+        """Make room for `capacity` rows, in lanes of the instruction set `isa` (by default the one in use)."""
         native = native_module()
         if native is None:
             raise ModelError("there is no compiled kernel here.")
-        self._n, self._sizes = n, sizes
-        self._lanes = native.Bank(instruction_set(), n, list(sizes), capacity)
+        self._n, self._sizes, self._isa = n, sizes, isa or instruction_set()
+        self._lanes = native.Bank(self._isa, n, list(sizes), capacity)
 
     def grow(self, capacity: int) -> None:
         """Make room for more rows."""
@@ -136,12 +136,14 @@ class NativeStore:
     def write(self, rows: _Rows, belief: Belief) -> None:
         """Overwrite rows."""
         lead, n = (len(rows), *self._sizes), self._n
-        self._lanes.write(
-            rows,
-            np.ascontiguousarray(np.broadcast_to(belief.log_probs, lead)),
-            np.ascontiguousarray(np.broadcast_to(belief.means, (*lead, n))),
-            np.ascontiguousarray(np.broadcast_to(belief.covs, (*lead, n, n))),
-        )
+        shapes = (lead, (*lead, n), (*lead, n, n))
+        self._lanes.write(rows, *(_full(a, shape) for a, shape in zip(belief, shapes, strict=True)))
+
+    def take(self, rows: _Rows) -> "NativeStore":
+        """Return a store whose rows 0..k-1 are copies of `rows`."""
+        store = NativeStore(self._n, self._sizes, len(rows), self._isa)
+        store.copy_from(np.arange(len(rows)), self, rows)
+        return store
 
     def copy_from(self, rows: _Rows, other: "NativeStore", other_rows: _Rows) -> None:
         """Overwrite rows with those of another store."""
@@ -166,3 +168,7 @@ class NativeStore:
         mean, cov, probs = np.empty((k, n)), np.empty((k, n, n)), np.empty((k, *self._sizes))
         self._lanes.moments(rows, mean, cov, probs)
         return mean, cov, probs
+
+
+def _full(a: _Array, shape: tuple[int, ...]) -> _Array:
+    return a if a.shape == shape else np.broadcast_to(a, shape)

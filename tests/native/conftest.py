@@ -1,0 +1,37 @@
+"""What the tests of the compiled kernel share; they skip where it was not built."""
+
+import os
+from contextlib import contextmanager
+
+import pytest
+
+from saltus.filters.backend import native_module
+
+ISAS = [] if native_module() is None else native_module().instruction_sets()
+
+
+def pytest_generate_tests(metafunc):
+    if "isa" in metafunc.fixturenames:
+        metafunc.parametrize("isa", ISAS or [pytest.param("", marks=pytest.mark.skip("the kernel was not built"))])
+
+
+@pytest.fixture(autouse=True)
+def kernel():
+    if native_module() is None:
+        pytest.skip("the kernel was not built")
+
+
+@pytest.fixture(scope="session")
+def using():
+    """A context in which the kernel of one instruction set is in use."""
+
+    @contextmanager
+    def context(isa):
+        before = os.environ.get("SALTUS_ISA")
+        os.environ["SALTUS_ISA"] = isa
+        try:
+            yield
+        finally:
+            os.environ.pop("SALTUS_ISA") if before is None else os.environ.update(SALTUS_ISA=before)
+
+    return context
