@@ -14,6 +14,7 @@ _EXPORTS = {
     "LinearSDE": "saltus.models",
     "PositionSensor": "saltus.models",
     "Record": "saltus.filters",
+    "coloured_filter": "saltus.filters",
     "constant_acceleration": "saltus.models",
     "constant_velocity": "saltus.models",
     "decide": "saltus.decisions",

@@ -53,14 +53,14 @@ class Belief(NamedTuple):
 class Joint(NamedTuple):
     """The joint prediction of state and measurement: x+ = A x + b + e, y = C x + d + f, cov[e; f] = N."""
 
-    mean: Float[np.ndarray, "*lead n"]  # of x+
+    mean: Float[np.ndarray, "*lead p"]  # of x+
     y: Float[np.ndarray, "*lead m"]
-    U: Float[np.ndarray, "*lead n m"]  # cov(x+, y)
+    U: Float[np.ndarray, "*lead p m"]  # cov(x+, y)
     S: Float[np.ndarray, "*lead m m"]  # cov(y)
     cov: Float[np.ndarray, "*lead n n"]  # of x, before the step
-    A: Float[np.ndarray, "*_a n n"]
+    A: Float[np.ndarray, "*_a p n"]
     C: Float[np.ndarray, "*_c m n"]
-    N: Float[np.ndarray, "*_n nm nm"]
+    N: Float[np.ndarray, "*_n pm pm"]
 
 
 class Conditioned(NamedTuple):
@@ -145,11 +145,11 @@ def propagate(
 def joint(
     mean: Float[np.ndarray, "*lead n"],
     cov: Float[np.ndarray, "*lead n n"],
-    A: Float[np.ndarray, "*_a n n"],
-    b: Float[np.ndarray, "*_b n"] | None,
+    A: Float[np.ndarray, "*_a p n"],
+    b: Float[np.ndarray, "*_b p"] | None,
     C: Float[np.ndarray, "*_c m n"],
     d: Float[np.ndarray, "*_d m"] | None,
-    N: Float[np.ndarray, "*_n nm nm"],
+    N: Float[np.ndarray, "*_n pm pm"],
 ) -> Joint:
     """Predict state and measurement together.
 
@@ -157,9 +157,9 @@ def joint(
     U = A P C' + N_ef,   S = C P C' + N_ff.
 
     White measurement noise after propagation is A = I, C = H, N = diag(0, R); coloured noise by differencing has
-    all blocks.
+    all blocks. A need not be square: differencing takes the measured part in after a gap and drops it when known.
     """
-    n = mean.shape[-1]
+    n = A.shape[-2]
     moved = (A @ mean[..., None])[..., 0]
     y = (C @ mean[..., None])[..., 0]
     U = A @ cov @ C.swapaxes(-1, -2) + N[..., :n, n:]
