@@ -32,6 +32,7 @@ REASONS = (
     "outside time window",  # --from / --to
     "site unknown",  # the source needs a site position and none is configured
     "system track",  # CAT062: another system's track, never used as a plot
+    "bearing alone",  # a camera's: without a range it starts no track
 )
 
 
@@ -40,8 +41,9 @@ class Kind:
 
     NONE = 0
     POLAR = 1  # slant range, azimuth (and elevation when the radar measures it), from the source's site
-    PLANE = 2  # east, north from the source's site
+    PLANE = 2  # east, north (and up) from the source's site
     GEODETIC = 3  # latitude, longitude
+    BEARING = 4  # azimuth (and elevation) alone, from the source's site
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +100,15 @@ class Plots:
     elevation: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad above the site's horizontal plane
     x: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m east of the site
     y: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m north of the site
+    z: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m above the site's horizontal plane
+    range_rate: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m/s, positive going away
     latitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad, WGS-84
     longitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad
     altitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m; pressure altitude if from Mode C
+    # The site of this report, of a source that moves; NaN = the source's own site.
+    observer_latitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad
+    observer_longitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad
+    observer_height: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m above the ellipsoid
     icao24: npt.NDArray[np.int32] = _column(np.int32, -1)
     mode3a: npt.NDArray[np.int16] = _column(np.int16, -1)  # the 12 bits, shown in octal
     callsign: npt.NDArray[Any] = _column("U8", "")  # text of up to 8 characters

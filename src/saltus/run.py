@@ -161,6 +161,7 @@ def _prepare(
     sensors = _sensors(plots.sources, recording, config)
     for s, source in enumerate(plots.sources):
         needs = (plots.source == s) & ((plots.kind == Kind.POLAR) | (plots.kind == Kind.PLANE)) & (reason == 0)
+        needs &= np.isnan(plots.observer_latitude)
         if sensors.sites[s] is None and needs.any():
             reason[needs] = REASONS.index("site unknown")
             problems.append(_site_wanted(source, int(needs.sum())))

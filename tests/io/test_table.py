@@ -5,6 +5,7 @@ import datetime
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pyproj
 import pytest
 
 from saltus.errors import DataError
@@ -136,6 +137,10 @@ def test_bad_cells_name_row_and_column_and_the_rest_is_kept(tmp_path):
         ("time,x_m,y_m\n1000,1\n", "no readable CSV"),
         ("time,x_m,x_m,y_m\n1,1,1,1\n", "column 'x_m' occurs 2 times"),
         ("time,range_m,azimuth_deg\n1e9,1,5000\n", r"row 0, column 'azimuth_deg': 5000 cannot be.*degrees"),
+        ("time,x_m,y_m,observer_x_m,observer_y_m\n1e9,1,2,3,4\n", "'observer_x_m' needs 'origin_latitude' beside it"),
+        ("time,x_m,y_m,origin_latitude\n1e9,1,2,3\n", "'origin_latitude' needs 'origin_longitude' beside it"),
+        ("time,x_m,y_m,observer_latitude,observer_longitude\n1e9,1,2,4.1e6,0\n", "column 'observer_latitude'.*degrees"),
+        ("time,x_m,y_m,range_rate_mps\n1e9,1,2,1e6\n", "column 'range_rate_mps'.*is it in m/s"),
         ("time,latitude,longitude\n1e9,4.1e6,2\n", r"row 0, column 'latitude': 4\.1e\+06 cannot be"),
         ("time,x_m,y_m\n1714564800000,1,2\n", r"column 'time': .*milliseconds"),
     ],
@@ -151,6 +156,81 @@ def test_parquet_that_cannot_be_used(tmp_path):
         read([tmp_path / "t.parquet"])
     with pytest.raises(DataError, match="give octal digits as text"):
         parquet(tmp_path, time=[1e9], x_m=[1.0], y_m=[1.0], mode3a=[1200])
+
+
+def test_an_observer_in_degrees(tmp_path):
+    got = csv(
+        tmp_path,
+        "time,range_m,azimuth_deg,heading_deg,observer_latitude,observer_longitude,observer_height_m\n"
+        "1000000000,50,350,30,63.4,10.4,40\n"
+        "1000000001,50,350,,63.4,10.4,\n"
+        "1000000002,50,350,30,,10.4,40\n",
+    )
+    p = got.plots
+    np.testing.assert_allclose(np.degrees(p.azimuth), [20.0, 350.0, 20.0], rtol=1e-14)  # from the bow, from north
+    np.testing.assert_allclose(np.degrees(p.observer_latitude), [63.4, 63.4, np.nan], rtol=1e-14)
+    np.testing.assert_array_equal(p.observer_height, [40.0, 0.0, np.nan])
+    assert got.problems == ()
+    assert got.contents[0].notes == ()
+
+
+def test_an_observer_in_a_frame_of_its_own(tmp_path):
+    # PROJ's topocentric conversion is the oracle.
+    got = csv(
+        tmp_path,
+        "time,x_m,y_m,z_m,observer_x_m,observer_y_m,origin_latitude,origin_longitude,origin_height_m\n"
+        "1000000000,1,2,3,4000,-9000,63.4,10.4,40\n"
+        "1000000001,1,2,,,,63.4,10.4,40\n",
+    )
+    to_geodetic = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0=63.4 +lon_0=10.4 +h_0=40 "
+        "+step +inv +proj=cart +ellps=WGS84"
+    )
+    lon, lat, height = to_geodetic.transform(4000.0, -9000.0, 0.0)
+    p = got.plots
+    np.testing.assert_allclose(np.degrees([p.observer_longitude[0], p.observer_latitude[0]]), [lon, lat], rtol=1e-12)
+    assert p.observer_height[0] == pytest.approx(height, abs=1e-6)
+    assert np.isnan(p.observer_latitude[1])  # a row whose observer is unknown is not at the origin
+    assert (p.x[0], p.y[0], p.z[0]) == (1.0, 2.0, 3.0)
+
+
+def test_the_origin_alone_is_the_observer(tmp_path):
+    got = csv(tmp_path, "time,x_m,y_m,origin_latitude,origin_longitude\n1e9,1,2,63.4,10.4\n1000000001,2,2,,\n")
+    np.testing.assert_allclose(np.degrees(got.plots.observer_latitude), [63.4, np.nan], rtol=1e-14)
+
+
+def test_kinds_stated_and_bearings(tmp_path):
+    got = csv(
+        tmp_path,
+        "time,kind,range_m,azimuth_deg,x_m,y_m\n"
+        "1000000000,,50,10,1,2\n"
+        "1000000001,plane,50,10,1,2\n"
+        "1000000002,Bearing,50,10,1,2\n"
+        "1000000003,,,10,,\n"
+        "1000000004,polar,,10,1,2\n"
+        "1000000005,sonar,50,10,,\n",
+    )
+    polar, plane, bearing = Kind.POLAR, Kind.PLANE, Kind.BEARING
+    assert got.plots.kind.tolist() == [polar, plane, bearing, bearing, polar, polar]
+    found = reasons(got)
+    assert [found[k] for k in (2, 3, 4)] == ["bearing alone", "bearing alone", "not a number"]
+    assert "row 5, column 'kind': 'sonar' is no kind" in got.problems[0]
+
+
+def test_an_impossible_heading_costs_the_azimuth(tmp_path):
+    rows = "".join(f"{1000000000 + k},50,10,{9000 if k == 1 else 30}\n" for k in range(4))
+    got = csv(tmp_path, "time,range_m,azimuth_deg,heading_deg\n" + rows)
+    assert reasons(got) == {0: "", 1: "not a number", 2: "", 3: ""}
+    assert "row 1, column 'heading_deg': '9000' is out of range" in got.problems[0]
+
+
+def test_scans_of_one_time_tell_the_update_period(tmp_path):
+    # Three detections a scan, one scan in four empty: the median of the steps is the period.
+    times = [1e9 + 0.5 * k for k in range(40) if k % 4 for _ in range(3)]
+    got = csv(tmp_path, "time,x_m,y_m\n" + "".join(f"{t},{k},1\n" for k, t in enumerate(times)))
+    assert got.contents[0].update_period == 0.5
+    got = csv(tmp_path, "time,x_m,y_m\n" + "".join(f"{1e9 + 0.01 * k},{k},1\n" for k in range(50)))
+    assert np.isnan(got.contents[0].update_period)
 
 
 def test_nothing_and_directories(tmp_path):

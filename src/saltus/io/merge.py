@@ -24,12 +24,19 @@ LIMITS = {
     "latitude": (-np.pi / 2, np.pi / 2),
     "longitude": (-np.pi, 2 * np.pi),
     "altitude": (-1500.0, 60000.0),
+    "z": (-60e3, 60e3),
+    "range_rate": (-10e3, 10e3),
+    "observer_latitude": (-np.pi / 2, np.pi / 2),
+    "observer_longitude": (-np.pi, 2 * np.pi),
+    "observer_height": (-1500.0, 60000.0),
     "time": (-DAY, 4.2e9),
 }
+_OBSERVER = ("observer_latitude", "observer_longitude", "observer_height")
 _POSITION = {
     Kind.POLAR: ("range", "azimuth"),
     Kind.PLANE: ("x", "y"),
     Kind.GEODETIC: ("latitude", "longitude"),
+    Kind.BEARING: ("azimuth", "elevation"),
 }
 
 
@@ -73,13 +80,15 @@ def _mark_values(plots: Plots, reason: npt.NDArray[np.int8]) -> None:
     not_number, outside = np.zeros(len(plots), np.bool_), np.zeros(len(plots), np.bool_)
     for kind, names in _POSITION.items():
         for name in names:
-            not_number |= (plots.kind == kind) & np.isnan(getattr(plots, name))
+            if name != "elevation":  # a bearing may have one
+                not_number |= (plots.kind == kind) & np.isnan(getattr(plots, name))
             outside |= (plots.kind == kind) & _outside(plots, name)
     _mark(reason, np.isnan(plots.time), "no time")
-    for name in ("time", "altitude", "elevation"):
+    for name in ("time", "altitude", "elevation", "z", "range_rate", *_OBSERVER):
         outside |= _outside(plots, name)
     _mark(reason, not_number, "not a number")
     _mark(reason, outside, "out of range")
+    _mark(reason, plots.kind == Kind.BEARING, "bearing alone")
 
 
 def _outside(plots: Plots, name: str) -> npt.NDArray[np.bool_]:

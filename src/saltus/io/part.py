@@ -9,9 +9,10 @@ from jaxtyping import Int
 
 from saltus.records import Contents, Plots
 
-__all__ = ["Part", "revisit"]
+__all__ = ["Part", "revisit", "scan_period"]
 
 _FEW = 5  # intervals that make a median
+_SHARED = 0.1  # of the reports share their time with another: the source dates scans, not reports
 
 
 class Part(NamedTuple):
@@ -41,3 +42,17 @@ def revisit(time: npt.ArrayLike, *identities: Int[np.ndarray, " n"]) -> float:
         if len(step) >= _FEW:
             return float(np.median(step))
     return float("nan")
+
+
+def scan_period(time: npt.ArrayLike) -> float:
+    """Median time between the scans of a source that gives all reports of a scan one time, NaN where it does not.
+
+    Args:
+        time: (N,) s, NaN = unknown.
+    """
+    times = np.asarray(time, np.float64)
+    scans, counts = np.unique(times[np.isfinite(times)], return_counts=True)
+    shared = counts[counts > 1].sum()
+    if len(scans) <= _FEW or shared < _SHARED * counts.sum():
+        return float("nan")
+    return float(np.median(np.diff(scans)))

@@ -4,10 +4,12 @@ Columns, by name; others are passed over and noted:
 
     time            UTC seconds since 1970-01-01, or ISO 8601 text (without an offset it is UTC); always needed
     range_m         slant range, m, with
-    azimuth_deg     degrees from north, clockwise, 0 to 360 (or -180 to 180), and
+    azimuth_deg     degrees from north, clockwise, 0 to 360 (or -180 to 180); from the bow where heading_deg is given
     elevation_deg   degrees above the horizontal, -90 to 90, if measured
-    x_m, y_m        m east and north of the sensor's site
+    range_rate_mps  m/s, positive going away; kept with the report, not used by the tracker
+    x_m, y_m, z_m   m east and north (and up, if measured) of the sensor's site, whatever the heading
     latitude, longitude  (or lat, lon)  degrees, WGS-84
+    kind            polar, plane, geodetic or bearing: which of these the row means, where it gives several
     altitude_m      m, -1500 to 60000
     icao24          Mode S address, six hexadecimal digits as text
     mode3a          Mode 3/A code, four octal digits as text
@@ -15,9 +17,12 @@ Columns, by name; others are passed over and noted:
     on_ground       (or onground)  true or 1 on the ground, false or 0 airborne
     source          the sensor's name; without it the file's name without suffix
 
-One of the three positions is needed; where a row gives several the first named above is taken. An empty cell (null,
-NaN) is absent. A row without time or position, or with a number that cannot be, is kept as a report with its reason; a
-code that cannot be read is lost alone. Rows count from 0, without the header.
+and, where the sensor moves, the columns of `saltus.io.observer` that say where it was.
+
+One position is needed: range and azimuth, x and y, latitude and longitude, or the azimuth alone (a bearing). Without
+`kind` the first of these that the row gives is taken. An empty cell (null, NaN) is absent. A row without time or
+position, or with a number that cannot be, is kept as a report with its reason; a code that cannot be read is lost
+alone. Rows count from 0, without the header.
 """
 
 import datetime
@@ -30,7 +35,8 @@ import pyarrow as pa
 
 from saltus.errors import DataError
 from saltus.io.merge import LIMITS
-from saltus.io.part import Part, revisit
+from saltus.io.observer import FRAME, observer_columns
+from saltus.io.part import Part, revisit, scan_period
 from saltus.records import Contents, Kind, Plots, Source, System
 
 __all__ = ["read_csv", "read_parquet"]
@@ -42,20 +48,31 @@ _NUMBERS = {
     "range_m": ("range", 1.0),
     "azimuth_deg": ("azimuth", _DEGREE),
     "elevation_deg": ("elevation", _DEGREE),
+    "range_rate_mps": ("range_rate", 1.0),
     "x_m": ("x", 1.0),
     "y_m": ("y", 1.0),
+    "z_m": ("z", 1.0),
     "latitude": ("latitude", _DEGREE),
     "longitude": ("longitude", _DEGREE),
     "altitude_m": ("altitude", 1.0),
+    **FRAME,
 }
 _POSITIONS = (
     (Kind.POLAR, ("range_m", "azimuth_deg")),
     (Kind.PLANE, ("x_m", "y_m")),
     (Kind.GEODETIC, ("latitude", "longitude")),
+    (Kind.BEARING, ("azimuth_deg",)),
 )
+_KINDS = {"polar": Kind.POLAR, "plane": Kind.PLANE, "geodetic": Kind.GEODETIC, "bearing": Kind.BEARING}
 _CODES = {"icao24": (16, 0xFFFFFF), "mode3a": (8, 0o7777)}  # base, largest
-_COLUMNS = ("time", *_NUMBERS, *_CODES, "callsign", "on_ground", "source")
+_COLUMNS = ("time", *_NUMBERS, *_CODES, "callsign", "on_ground", "source", "kind")
 _TRUTH = {"true": 1, "1": 1, "1.0": 1, "t": 1, "yes": 1, "false": 0, "0": 0, "0.0": 0, "f": 0, "no": 0}
+_LIMIT_OF = {"heading": "azimuth", "origin_latitude": "latitude", "origin_longitude": "longitude"} | {
+    "observer_x": "x",
+    "observer_y": "y",
+    "observer_z": "z",
+    "origin_height": "observer_height",
+}
 _HALF = 0.5  # a column with more impossible values than this has another unit
 
 
@@ -116,9 +133,11 @@ def _read(path: Path, table: pa.Table) -> Part:
     if "on_ground" in names:
         columns["on_ground"] = _truths(path, table["on_ground"], problems)
     columns["kind"] = _kinds(columns, names)
+    if "kind" in names:
+        columns["kind"] = _stated_kinds(path, table["kind"], columns["kind"], problems)
     _check_units(path, columns)
     _tell_impossible(path, columns, problems)
-    return _part(path, table, columns, problems)
+    return _part(path, table, observer_columns(path, columns), problems)
 
 
 def _need_columns(path: Path, names: Sequence[str]) -> None:
@@ -215,12 +234,23 @@ def _kinds(columns: dict[str, npt.ArrayLike], names: Sequence[str]) -> npt.NDArr
     """How each row gives its position: the first pair with both cells, else a pair that lacks one."""
     n = len(np.asarray(columns["time"]))
     kinds = np.full(n, Kind.NONE, np.int8)
-    for needed in (2, 1):
+    for missing in (0, 1):
         for kind, pair in _POSITIONS:
             if set(pair) <= set(names):
                 given = sum(~np.isnan(np.asarray(columns[_NUMBERS[c][0]])) for c in pair)
-                kinds[(kinds == Kind.NONE) & (given >= needed)] = kind
+                kinds[(kinds == Kind.NONE) & (given > 0) & (given >= len(pair) - missing)] = kind
     return kinds
+
+
+def _stated_kinds(
+    path: Path, column: pa.ChunkedArray, found: npt.ArrayLike, problems: list[str]
+) -> npt.NDArray[np.int8]:
+    """What the column `kind` says, else what the row gives."""
+    cells = [str(v or "").strip().lower() for v in column.to_pylist()]
+    bad = [(k, v) for k, v in enumerate(cells) if v and v not in _KINDS]
+    _tell(path, "kind", bad, f"no kind of report ({', '.join(_KINDS)})", problems)
+    stated = np.array([_KINDS.get(v, Kind.NONE) for v in cells], np.int8)
+    return np.where(stated == Kind.NONE, np.asarray(found), stated)
 
 
 def _check_units(path: Path, columns: dict[str, npt.ArrayLike]) -> None:
@@ -250,14 +280,14 @@ def _impossible(
     for name, (target, factor) in {"time": ("time", 1.0), **_NUMBERS}.items():
         if target in columns:
             values = np.asarray(columns[target], np.float64)
-            low, high = LIMITS[target]
+            low, high = LIMITS[_LIMIT_OF.get(target, target)]
             outside = ~np.isnan(values) & ~((values >= low * (1 + 1e-12)) & (values <= high * (1 + 1e-12)))
             found.append((name, values / factor, outside))
     return found
 
 
 def _unit(name: str) -> str:
-    return "m" if name.endswith("_m") else "degrees"
+    return "m/s" if name.endswith("_mps") else "m" if name.endswith("_m") else "degrees"
 
 
 def _tell(path: Path, name: str, bad: Sequence[tuple[int, object]], what: str, problems: list[str]) -> None:
@@ -290,7 +320,13 @@ def _part(path: Path, table: pa.Table, columns: dict[str, npt.ArrayLike], proble
 def _contents(path: Path, system: System, own: Plots, table: pa.Table, notes: tuple[str, ...]) -> Contents:
     given = {c: table[c].take(pa.array(own.record)) for c in table.column_names if c in _COLUMNS}
     times = own.time[np.isfinite(own.time)]
-    kinds = {Kind.POLAR: "range and azimuth", Kind.PLANE: "plane position", Kind.GEODETIC: "latitude and longitude"}
+    period = revisit(own.time, own.icao24, own.mode3a)
+    kinds = {
+        Kind.POLAR: "range and azimuth",
+        Kind.PLANE: "plane position",
+        Kind.GEODETIC: "latitude and longitude",
+        Kind.BEARING: "bearing",
+    }
     counts = {text: int(np.count_nonzero(own.kind == kind)) for kind, text in kinds.items()}
     return Contents(
         file=path.name,
@@ -300,7 +336,7 @@ def _contents(path: Path, system: System, own: Plots, table: pa.Table, notes: tu
         n_reports=len(own),
         time_from=float(times.min()) if len(times) else float("nan"),
         time_to=float(times.max()) if len(times) else float("nan"),
-        update_period=revisit(own.time, own.icao24, own.mode3a),
+        update_period=scan_period(own.time) if np.isnan(period) else period,
         fields={c: len(v) - v.null_count for c, v in given.items()},
         rejected={},
         n_by_type={text: n for text, n in counts.items() if n},

@@ -24,24 +24,31 @@ def plot_positions(plots: Plots, sites: Mapping[str, "Site"]) -> npt.NDArray[np.
 
     Reports without height are placed as if at the height of their site: at most some tenths of a mile too far out.
     """
-    from saltus.geo import polar_to_geodetic
-
     out = np.column_stack([plots.latitude, plots.longitude])
+    todo, moves = np.isnan(out).any(axis=1), np.isfinite(plots.observer_latitude)
     for k, source in enumerate(plots.sources):
         site = site_of(str(source.system), source.system.name, sites)
-        if site is None:
-            continue
-        todo = np.flatnonzero((plots.source == k) & np.isnan(out).any(axis=1))
-        part = plots.take(todo)
-        plane = part.kind == Kind.PLANE
-        slant = np.where(plane, np.hypot(part.x, part.y), part.range)
-        azimuth = np.where(plane, np.arctan2(part.x, part.y), part.azimuth)
-        height = np.where(plane | np.isnan(part.altitude), site.height, part.altitude)
-        good = np.isfinite(slant) & np.isfinite(azimuth) & (slant >= 0) & (slant < _FARTHEST)
-        if good.any():
-            place = polar_to_geodetic(slant[good], azimuth[good], height[good], site)
-            out[todo[good]] = np.column_stack([place[0], place[1]])
+        if site is not None:
+            _place(out, plots, todo & ~moves & (plots.source == k), site)
+    _place(out, plots, todo & moves, None)
     return out
+
+
+def _place(out: npt.NDArray[np.float64], plots: Plots, which: npt.NDArray[np.bool_], fixed: "Site | None") -> None:
+    """Write the positions of reports seen from one site, or (None) each from its own observer."""
+    from saltus.geo import Sites, polar_to_geodetic
+
+    plane = plots.kind == Kind.PLANE
+    slant = np.where(plane, np.hypot(plots.x, plots.y), plots.range)
+    azimuth = np.where(plane, np.arctan2(plots.x, plots.y), plots.azimuth)
+    with np.errstate(invalid="ignore"):
+        which = which & np.isfinite(slant) & np.isfinite(azimuth) & (slant >= 0) & (slant < _FARTHEST)
+    if which.any():
+        part, plane = plots.take(which), plane[which]
+        site = fixed or Sites(part.observer_latitude, part.observer_longitude, part.observer_height)
+        height = np.where(plane | np.isnan(part.altitude), site.height, part.altitude)
+        place = polar_to_geodetic(slant[which], azimuth[which], height, site)
+        out[which] = np.column_stack([place[0], place[1]])
 
 
 def site_of(system: str, name: str, sites: Mapping[str, "Site"]) -> "Site | None":

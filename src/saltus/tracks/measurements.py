@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import product
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +12,11 @@ from saltus.geo import (
     Plane,
     PlanePositions,
     Site,
+    Sites,
+    ecef_to_geodetic,
+    geodetic_to_ecef,
     geodetic_to_plane,
+    local_basis,
     local_to_plane,
     polar_to_plane,
     spherical_to_plane,
@@ -124,22 +129,29 @@ class Measurements:
 
 
 def make_plane(plots: Plots, sites: Sequence[Site | None]) -> Plane:
-    """Return the plane centred among the sites, or among the reports where no source has a site.
+    """Return the plane centred among the sites, else among the reports, else where moving observers were.
 
     Raises:
-        DataError: there is neither a site nor a geodetic position.
+        DataError: there is neither a site nor a geodetic position nor an observer's.
     """
     known = [s for s in sites if s is not None]
     if known:
         east = known[0].longitude + wrap([s.longitude - known[0].longitude for s in known])  # also across 180 degrees
         return Plane(float(np.mean([s.latitude for s in known])), float(wrap(np.mean(east))))
     at = (plots.kind == Kind.GEODETIC) & (plots.reason == 0)
+    moved = np.isfinite(plots.observer_latitude) & (plots.reason == 0)
+    if not at.any() and moved.any():
+        return _about(plots.observer_latitude[moved], plots.observer_longitude[moved])
     if not at.any():
         raise DataError(
             "no report can be placed on the map: no source has a site position and none gives latitude and longitude. "
             "Give each radar's site as [[sensor]] sac, sic, latitude, longitude, height in the configuration."
         )
-    return Plane(float(np.median(plots.latitude[at])), float(np.median(plots.longitude[at])))
+    return _about(plots.latitude[at], plots.longitude[at])
+
+
+def _about(latitude: _Array, longitude: _Array) -> Plane:
+    return Plane(float(np.median(latitude)), float(np.median(longitude)))
 
 
 def place_plots(
@@ -154,7 +166,8 @@ def place_plots(
     Args:
         plots: reports in time order.
         plane: the tracker's plane.
-        sites: site per source; reports of a source without a needed site must carry a reason already.
+        sites: site per source, of the reports that tell no observer; those of a source without a needed site must
+            carry a reason already.
         noise: per source index.
         height_prior: mean and standard deviation of unknown heights, m.
     """
@@ -162,15 +175,16 @@ def place_plots(
     n = len(usable)
     position, cov = np.full((n, 3), np.nan), np.zeros((n, 3, 3))
     lever, ray = np.zeros((n, 2)), np.full((n, 2), np.nan)
-    for s in range(len(plots.sources)):
-        for kind in (Kind.POLAR, Kind.PLANE, Kind.GEODETIC):
-            at = np.flatnonzero((plots.source[usable] == s) & (plots.kind[usable] == kind))
-            if len(at):
-                placed = _place(plots.take(usable[at]), kind, plane, sites[s], noise[s], height_prior)
-                _fill(position, cov, lever, at, placed)
-                site = sites[s]
-                if kind == Kind.POLAR and site is not None:
-                    ray[at] = placed.xy - plane.forward(site.latitude, site.longitude)
+    moved = np.isfinite(plots.observer_latitude[usable])
+    for s, kind, moves in product(range(len(plots.sources)), (Kind.POLAR, Kind.PLANE, Kind.GEODETIC), (False, True)):
+        at = np.flatnonzero((plots.source[usable] == s) & (plots.kind[usable] == kind) & (moved == moves))
+        if len(at):
+            own = plots.take(usable[at])
+            placed = _place(own, kind, plane, sites[s], noise[s], height_prior)
+            _fill(position, cov, lever, at, placed)
+            site = _site(own, sites[s])
+            if kind == Kind.POLAR and site is not None:
+                ray[at] = placed.xy - plane.forward(site.latitude, site.longitude)
     return Measurements(
         plot=usable,
         time=plots.time[usable],
@@ -186,15 +200,24 @@ def place_plots(
     )
 
 
+def _site(plots: Plots, site: Site | None) -> Site | Sites | None:
+    """Where reports of one source were seen from; all of them tell an observer, or none does."""
+    if len(plots) and np.isfinite(plots.observer_latitude[0]):
+        return Sites(plots.observer_latitude, plots.observer_longitude, plots.observer_height)
+    return site
+
+
 def _place(
-    plots: Plots, kind: int, plane: Plane, site: Site | None, noise: Noise, height_prior: tuple[float, float]
+    plots: Plots, kind: int, plane: Plane, fixed: Site | None, noise: Noise, height_prior: tuple[float, float]
 ) -> PlanePositions:
     if kind == Kind.GEODETIC:
         return geodetic_to_plane(plots.latitude, plots.longitude, plots.altitude, plane, noise.xy, noise.altitude)
+    site = _site(plots, fixed)
     if site is None:
         raise DataError("internal: a report relative to an unknown site reached the tracker")
     if kind == Kind.PLANE:
-        return local_to_plane(plots.x, plots.y, plots.altitude, site, plane, noise.xy, noise.altitude)
+        altitude = np.where(np.isnan(plots.altitude), _height(plots, site), plots.altitude)
+        return local_to_plane(plots.x, plots.y, altitude, site, plane, noise.xy, noise.altitude)
     flat = polar_to_plane(
         plots.range,
         plots.azimuth,
@@ -213,7 +236,7 @@ def _place(
         plots.range[measured],
         plots.azimuth[measured],
         plots.elevation[measured],
-        site,
+        _site(plots.take(measured), fixed) or site,
         plane,
         sigma_range=noise.range,
         sigma_azimuth=noise.azimuth,
@@ -222,6 +245,12 @@ def _place(
     for column, values in zip(flat, solid, strict=True):
         column[measured] = values
     return flat
+
+
+def _height(plots: Plots, site: Site | Sites) -> _Array:
+    """Height above the ellipsoid of reports that give x, y and z; NaN without z."""
+    local = np.stack([plots.x, plots.y, plots.z], axis=-1)[:, None, :] @ local_basis(site.latitude, site.longitude)
+    return ecef_to_geodetic(geodetic_to_ecef(site.latitude, site.longitude, site.height) + local[:, 0])[2]
 
 
 def _fill(position: _Array, cov: _Array, lever: _Array, at: npt.NDArray[np.intp], placed: PlanePositions) -> None:

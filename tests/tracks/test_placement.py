@@ -1,0 +1,98 @@
+"""Reports of moving observers in the tracker's plane, against PROJ."""
+
+import numpy as np
+import pyproj
+import pytest
+
+from saltus.errors import DataError
+from saltus.geo import Plane, Site
+from saltus.records import Kind, Plots, Source, System
+from saltus.tracks.measurements import Noise, make_plane, place_plots
+
+N = 30
+NOISE = Noise(range=3.0, azimuth=0.01, elevation=0.02, xy=2.0, altitude=1.0)
+
+
+@pytest.fixture
+def sea(rng):
+    """A ship's track, and targets east, north and up of it with their places by PROJ."""
+    ship = np.stack([63.4 + 0.05 * rng.random(N), 10.4 + 0.1 * rng.random(N), 40.0 + rng.random(N)])
+    enu = np.stack([800.0 * rng.standard_normal(N), 800.0 * rng.standard_normal(N), 50.0 * rng.random(N)])
+    places = []
+    for (lat, lon, h), offset in zip(ship.T, enu.T, strict=True):
+        to_geodetic = pyproj.Transformer.from_pipeline(
+            f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0={lat} +lon_0={lon} +h_0={h} "
+            "+step +inv +proj=cart +ellps=WGS84"
+        )
+        places.append(to_geodetic.transform(*offset))
+    return ship, enu, np.array(places).T
+
+
+def reports(ship, kind, **columns):
+    latitude, longitude = np.radians(ship[:2])
+    observer = {"observer_latitude": latitude, "observer_longitude": longitude, "observer_height": ship[2]}
+    common = {"time": np.arange(N, dtype=float), "source": np.zeros(N), "kind": np.full(N, kind)}
+    return Plots.build(N, (Source(System(None, None, None, "ship")),), ("t",), common | observer | columns)
+
+
+def placed(plots):
+    plane = make_plane(plots, [None])
+    return place_plots(plots, plane, [None], {0: NOISE}, (0.0, 30.0)), plane
+
+
+def test_the_plane_lies_about_the_observers(sea):
+    ship, _, _ = sea
+    plane = make_plane(reports(ship, Kind.PLANE), [None])
+    assert isinstance(plane, Plane)
+    np.testing.assert_allclose(np.degrees([plane.latitude, plane.longitude]), np.median(ship[:2], axis=1))
+    with pytest.raises(DataError, match="no report can be placed"):
+        make_plane(reports(np.full((3, N), np.nan), Kind.PLANE), [None])
+
+
+def test_east_north_up_of_a_moving_observer(sea):
+    ship, (x, y, z), (lon, lat, h) = sea
+    m, plane = placed(reports(ship, Kind.PLANE, x=x, y=y, z=z))
+    np.testing.assert_allclose(m.position[:, :2], plane.forward(np.radians(lat), np.radians(lon)), atol=1e-3)
+    np.testing.assert_allclose(m.position[:, 2], h, atol=1e-3)
+    np.testing.assert_allclose(m.cov[:, [0, 1, 2], [0, 1, 2]], [[4.0, 4.0, 1.0]] * N, rtol=1e-3)
+    assert np.isnan(m.ray).all()
+    flat, _ = placed(reports(ship, Kind.PLANE, x=x, y=y))
+    assert np.isnan(flat.position[:, 2]).all()
+    np.testing.assert_allclose(flat.position[:, :2], m.position[:, :2], atol=0.2)  # its height is taken for the ship's
+
+
+def test_range_and_azimuth_from_a_moving_observer(sea):
+    ship, (x, y, z), (lon, lat, h) = sea
+    plots = reports(
+        ship,
+        Kind.POLAR,
+        range=np.sqrt(x * x + y * y + z * z),
+        azimuth=np.arctan2(x, y),
+        elevation=np.where(np.arange(N) % 2, np.arctan2(z, np.hypot(x, y)), np.nan),
+        altitude=h,
+    )
+    m, plane = placed(plots)
+    # The bias removed is rho sigma^2 / 2, of the azimuth and (where measured) the elevation: below 1 m here.
+    np.testing.assert_allclose(m.position[:, :2], plane.forward(np.radians(lat), np.radians(lon)), atol=1.0)
+    np.testing.assert_allclose(m.ray, m.position[:, :2] - plane.forward(*np.radians(ship[:2])), atol=1e-9)
+    across = np.stack([-m.ray[:, 1], m.ray[:, 0]], axis=-1) / np.linalg.norm(m.ray, axis=-1)[:, None]
+    sigma = np.sqrt(np.einsum("ni,nij,nj->n", across, m.cov[:, :2, :2], across))
+    np.testing.assert_allclose(sigma, np.hypot(x, y) * NOISE.azimuth, rtol=0.01)
+
+
+def test_reports_without_observer_are_seen_from_the_source_s_site(sea):
+    ship, (x, y, z), _ = sea
+    fixed = Site(*np.radians([63.42, 10.45]).tolist(), 12.0)
+    always = np.broadcast_to([[63.42], [10.45], [12.0]], ship.shape)
+    alone = np.where(np.arange(N) % 2, ship, np.nan)
+    plane = Plane(fixed.latitude, fixed.longitude)
+
+    def place(observers, site):
+        plots = reports(observers, Kind.PLANE, x=x, y=y, z=z)
+        return place_plots(plots, plane, [site], {0: NOISE}, (0.0, 30.0)).position
+
+    mixed = place(alone, fixed)
+    np.testing.assert_allclose(mixed[1::2], place(ship, None)[1::2], atol=1e-6)
+    np.testing.assert_allclose(mixed[::2], place(always, None)[::2], atol=1e-6)
+    with pytest.raises(DataError, match="unknown site"):
+        place(alone, None)
