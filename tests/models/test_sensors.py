@@ -4,11 +4,33 @@ import numpy as np
 import pytest
 
 from saltus.errors import ModelError
-from saltus.models import SENSORS, Chain, LinearSensor, PositionSensor
+from saltus.models import (
+    SENSORS,
+    BoundSensor,
+    Chain,
+    FunctionSensor,
+    LinearSensor,
+    Observer,
+    PolarSensor,
+    PositionSensor,
+)
+
+
+def squares(x):
+    return x[..., :2] ** 2 / 1e3
+
 
 EXAMPLES = {
-    "LinearSensor": LinearSensor(H=[[1.0, 0, 2, 0]], R=[[4.0]], d=[3.0], prob_detection=0.9),
-    "PositionSensor": PositionSensor(dims=2, sigma=[3.0, 5.0]),
+    "LinearSensor": [LinearSensor(H=[[1.0, 0, 2, 0]], R=[[4.0]], d=[3.0], prob_detection=0.9)],
+    "PositionSensor": [PositionSensor(dims=2, sigma=[3.0, 5.0])],
+    "PolarSensor": [
+        PolarSensor(sigma_range=30.0, sigma_azimuth=0.01, sigma_range_rate=2.0, offset=[5.0, 0.1, 1.0]),
+        PolarSensor(sigma_azimuth=0.01, observer=Observer([300.0, -200.0], heading=2.0), prob_detection=0.9),
+        PolarSensor(sigma_range=5.0),
+        PolarSensor(sigma_range_rate=0.5, observer=Observer([300.0, -200.0], velocity=[10.0, 5.0])),
+        PolarSensor(sigma_range=5.0, sigma_azimuth=0.01, sigma_elevation=0.02, dims=3, axes=(0, 2, 3)),
+    ],
+    "FunctionSensor": [FunctionSensor(function=squares, R=np.eye(2), angles=(1,), offset=[1.0, 2.0])],
 }
 
 
@@ -16,16 +38,17 @@ def test_every_sensor_has_an_example():
     assert set(SENSORS) == set(EXAMPLES)
 
 
-@pytest.fixture(params=sorted(SENSORS))
+@pytest.fixture(params=[(name, i) for name in sorted(SENSORS) for i in range(len(EXAMPLES.get(name, [])))], ids=str)
 def sensor(request):
-    assert type(EXAMPLES[request.param]) is SENSORS[request.param]
-    return EXAMPLES[request.param]
+    name, i = request.param
+    assert type(EXAMPLES[name][i]) is SENSORS[name]
+    return EXAMPLES[name][i]
 
 
 def test_jacobian_is_the_derivative(sensor, rng):
     x = rng.normal(size=(3, 4)) * 1e3
     step = 1e-3
-    moved = [sensor.h(x + step * np.eye(4)[i]) - sensor.h(x - step * np.eye(4)[i]) for i in range(4)]
+    moved = [sensor.residual(sensor.h(x + step * e), sensor.h(x - step * e)) for e in np.eye(4)]
     np.testing.assert_allclose(sensor.jacobian(x), np.stack(moved, axis=-1) / (2 * step), atol=1e-6)
 
 
@@ -38,10 +61,19 @@ def test_residual_of_a_prediction_is_zero(sensor, rng):
 def test_bound_form_measures_the_same(sensor, rng):
     x = rng.normal(size=(5, 4))
     bound = sensor.bind([], 4)
-    H, R, d = bound.measured(None)
-    np.testing.assert_allclose(x @ H.T + (0 if d is None else d), sensor.h(x))
-    np.testing.assert_array_equal(R, sensor.R)
-    assert bound.prob_detection == sensor.prob_detection
+    assert isinstance(bound, BoundSensor)
+    now = bound.at(3.0)
+    np.testing.assert_allclose(now.h(x), sensor.h(x))
+    np.testing.assert_array_equal(now.noise(), sensor.R)
+    assert bound.prob_detection == now.prob_detection == sensor.prob_detection
+
+
+def test_bound_form_of_linear_sensors_has_their_matrices(rng):
+    x = rng.normal(size=(5, 4))
+    for sensor in (*EXAMPLES["LinearSensor"], *EXAMPLES["PositionSensor"]):
+        H, R, d = sensor.bind([], 4).measured(None)
+        np.testing.assert_allclose(x @ H.T + (0 if d is None else d), sensor.h(x))
+        np.testing.assert_array_equal(R, sensor.R)
 
 
 def test_compares_and_pickles(sensor):

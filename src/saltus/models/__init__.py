@@ -1,5 +1,8 @@
 """What the world is: chains, motion, sensors and priors, as descriptions that compile to arrays."""
 
+from dataclasses import is_dataclass
+
+from saltus.models import nonlinear, polar, sensors
 from saltus.models.arrays import Arrays, Layout
 from saltus.models.chain import Chain
 from saltus.models.dynamics import Dynamics, LinearSDE, LinearTransition, Step
@@ -8,14 +11,19 @@ from saltus.models.findings import Finding
 from saltus.models.gaussian import Gaussian
 from saltus.models.hybrid import HybridModel
 from saltus.models.motion import Motion, constant_acceleration, constant_velocity, singer
-from saltus.models.sensors import SENSORS, LinearSensor, PositionSensor, Sensor
+from saltus.models.nonlinear import FunctionSensor
+from saltus.models.observer import Observer
+from saltus.models.polar import PolarSensor
+from saltus.models.sensors import BoundSensor, LinearSensor, PositionSensor, Sensor
 
 __all__ = [
     "SENSORS",
     "Arrays",
+    "BoundSensor",
     "Chain",
     "Dynamics",
     "Finding",
+    "FunctionSensor",
     "Gaussian",
     "HybridModel",
     "Layout",
@@ -23,6 +31,8 @@ __all__ = [
     "LinearSensor",
     "LinearTransition",
     "Motion",
+    "Observer",
+    "PolarSensor",
     "PositionSensor",
     "Sensor",
     "Step",
@@ -32,3 +42,11 @@ __all__ = [
     "exponential",
     "singer",
 ]
+
+# Every sensor: the dataclasses that the modules of sensors offer.
+SENSORS = {
+    name: getattr(module, name)
+    for module in (sensors, polar, nonlinear)
+    for name in module.__all__
+    if is_dataclass(getattr(module, name))
+}

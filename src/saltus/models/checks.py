@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from saltus.errors import ModelError
 
-__all__ = ["FloatArray", "covariance", "intervals", "numbers", "same", "unit_steps"]
+__all__ = ["FloatArray", "covariance", "intervals", "numbers", "probability", "same", "unit_steps"]
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
@@ -79,6 +79,16 @@ def intervals(dt: object, what: str = "dt") -> FloatArray:
     if array.size and array.min() < 0:
         raise ModelError(f"{what} must not be negative, got {array.min():g} s. Sort measurements by time.")
     return array
+
+
+def probability(value: float, what: str) -> None:
+    """Refuse what is no positive probability.
+
+    Raises:
+        ModelError: the value does not lie in (0, 1].
+    """
+    if not 0 < value <= 1:
+        raise ModelError(f"{what} must lie in (0, 1], got {value!r}.")
 
 
 def unit_steps(dt: FloatArray, what: str, remedy: str) -> npt.NDArray[np.int64]:

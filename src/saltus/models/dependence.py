@@ -185,7 +185,7 @@ def _mode_axes(array: FloatArray, chains: Sequence[Chain], what: str, core: tupl
     n_core = core if isinstance(core, int) else len(core)
     if array.ndim <= n_core and (array.ndim == n_core or not isinstance(core, int)):
         array = _core(array, what, core)
-        return array.reshape(*(1,) * len(chains), *array.shape)
+        return array.reshape((*(1,) * len(chains), *array.shape))
     expected = [f"{len(c)} or 1 ({c.name})" for c in chains]
     fits = array.ndim == n_core + len(chains) and all(
         size in (1, len(c)) for size, c in zip(array.shape, chains, strict=False)

@@ -1,7 +1,7 @@
 """What is doubtful about a model, as values: nothing here raises."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from itertools import combinations
 
 import numpy as np
@@ -11,6 +11,7 @@ from saltus.models.checks import FloatArray
 from saltus.models.dependence import TimeDependent, fixed
 from saltus.models.dynamics import LinearSDE, LinearTransition
 from saltus.models.hybrid import HybridModel
+from saltus.models.sensors import BoundSensor, LinearSensor
 
 __all__ = ["Finding", "check"]
 
@@ -33,18 +34,22 @@ def check(model: HybridModel) -> list[Finding]:
     """Look for what is admissible but probably not meant.
 
     Kinds: `indistinguishable` modes, `undiscretised`, `not-continuous` and `unstable` matrices, `no-noise`,
-    `unobservable` state components, `unreachable` states. Matrices that depend on `t` are not looked at.
+    `unobservable` state components, `unreachable` states. Matrices that depend on `t` are not looked at, and with a
+    nonlinear sensor nothing is said of observability, which then depends on where the object is.
     """
     found = list(_motion(model)) + list(_unreachable(model))
     if not _depends_on_t(model):
-        arrays = model.compile(dt=1.0)  # any interval tells modes apart
-        found += [*_alike(model, arrays), *_noiseless(arrays), *_unobservable(model, arrays)]
+        linear = [name for name, sensor in model.sensors.items() if isinstance(sensor, LinearSensor)]
+        arrays = model.compile(dt=1.0, sensor=linear)  # any interval tells modes apart
+        found += [*_alike(model, arrays), *_noiseless(arrays)]
+        if len(linear) == len(model.sensors):
+            found += _unobservable(model, arrays)
     return found
 
 
 def _depends_on_t(model: HybridModel) -> bool:
-    parts = [model.dynamics, *model.sensors.values()]
-    values = [getattr(part, name, None) for part in parts for name in ("F", "Q", "b", "H", "R", "d")]
+    parts = [part for part in (model.dynamics, *model.sensors.values()) if is_dataclass(part)]
+    values = [getattr(part, f.name) for part in parts for f in fields(part)]
     return any(isinstance(value, TimeDependent) and "t" in value.words for value in values)
 
 
@@ -121,11 +126,20 @@ def _signature(model: HybridModel, arrays: Arrays) -> FloatArray:
     """Everything a measurement can depend on, one row per joint mode, each array scaled to at most 1."""
     parts = []
     shapes = ((arrays.F, 2), (arrays.Q, 2), (arrays.b, 1), (arrays.H, 2), (arrays.R, 2), (arrays.d, 1))
-    for array, n_core in (*shapes, (arrays.mean0, 1), (arrays.cov0, 2)):
+    for array, n_core in (*shapes, (arrays.mean0, 1), (arrays.cov0, 2), *_nonlinear(model, arrays.mean0)):
         if array is not None:
             flat = _flat(model, array, n_core).reshape(model.n_modes, -1)
-            parts.append(flat / np.maximum(np.abs(flat).max(axis=0), 1e-300))
+            parts.append(flat / np.maximum(np.abs(flat).max(axis=0, initial=0.0), 1e-300))
     return np.concatenate(parts, axis=1)
+
+
+def _nonlinear(model: HybridModel, mean: FloatArray) -> Iterator[tuple[FloatArray, int]]:
+    """Noise and expected measurement, at the prior's mean, of every sensor without matrices."""
+    for sensor in model.sensors.values():
+        if isinstance(sensor, BoundSensor) and not isinstance(sensor, LinearSensor):
+            now = sensor.at(0.0)
+            with np.errstate(invalid="ignore", divide="ignore"):  # a range rate at the observer's place
+                yield from ((now.noise(), 2), (np.nan_to_num(now.h(mean)), 1))
 
 
 def _alike(model: HybridModel, arrays: Arrays) -> Iterator[Finding]:

@@ -15,7 +15,7 @@ from saltus.models.checks import FloatArray, intervals, numbers, same
 from saltus.models.dependence import fixed
 from saltus.models.dynamics import Dynamics, Step
 from saltus.models.gaussian import Gaussian
-from saltus.models.sensors import LinearSensor, Measured, Sensor
+from saltus.models.sensors import BoundSensor, LinearSensor, Measured, Sensor
 
 if TYPE_CHECKING:
     from saltus.models.findings import Finding
@@ -27,7 +27,8 @@ __all__ = ["HybridModel"]
 class HybridModel:
     """A continuous state whose motion and measurements depend on independent hidden Markov chains.
 
-    x(t_k) = F x(t_{k-1}) + b + w,  z_k = H x(t_k) + d + v; each matrix depends on the chains it names.
+    x(t_k) = F x(t_{k-1}) + b + w,  z_k = H x(t_k) + d + v, or h(x(t_k)) + v of a nonlinear sensor; each matrix depends
+    on the chains it names.
 
     When built, functions of chains are called once per combination of states and only arrays are kept, so that models
     can be compared, printed and pickled; functions that also ask for `t` or `dt` are kept.
@@ -110,7 +111,8 @@ class HybridModel:
         Args:
             times: times of the measurements, (T,), s, not decreasing.
             dt: one interval for all steps, or the interval before each measurement, (T,), s.
-            sensor: the sensor that measures in every row, or several, stacked; by default all.
+            sensor: the sensor that measures in every row, or several, stacked; by default all. With none, `()`, H and
+                R have no rows, and any sensors may be left to a filter that linearises them.
 
         Returns:
             Arrays, without a time axis where all intervals are equal.
@@ -176,7 +178,10 @@ class HybridModel:
     def _sensor(self, name: str) -> LinearSensor:
         sensor = self.sensors[name]
         if not isinstance(sensor, LinearSensor):
-            raise ModelError(f"sensor {name!r} is not linear: a {type(sensor).__name__} has no matrices.")
+            raise ModelError(
+                f"sensor {name!r} is not linear: a {type(sensor).__name__} has no matrices.\n"
+                "IMM(model).run(records) linearises it; compile takes the linear ones with sensor=[...]."
+            )
         return sensor
 
     def _prior_time(self, t: FloatArray) -> float:
@@ -199,14 +204,20 @@ class HybridModel:
         return Step(motion.F[take], motion.Q[take], b), trans
 
     def _measured(self, names: Sequence[str], t: FloatArray | None) -> Measured:
+        if not names:
+            H = np.zeros((*(1,) * len(self.chains), 0, self.n_state))
+            return Measured(H, H[..., :0], None)
         return stack_sensors([self._sensor(name).measured(t) for name in names])
 
 
-def _bind_sensor(name: str, sensor: Sensor, chains: Sequence[Chain], n_state: int) -> LinearSensor:
+def _bind_sensor(name: str, sensor: Sensor, chains: Sequence[Chain], n_state: int) -> BoundSensor:
     try:
-        return sensor.bind(chains, n_state)
+        bound = sensor.bind(chains, n_state)
     except ModelError as error:
         raise ModelError(f"sensor {name!r}: {error}") from None
+    if not isinstance(bound, BoundSensor):
+        raise ModelError(f"sensor {name!r}: bind gave {type(bound).__name__}, which lacks at() or noise().")
+    return bound
 
 
 def _names(sensor: str | Sequence[str] | None, known: list[str]) -> list[str]:

@@ -1,7 +1,7 @@
 """What sensors measure: one frozen dataclass each, independent of any filter."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -10,10 +10,11 @@ from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.chain import Chain
-from saltus.models.checks import FloatArray, covariance, numbers, same
+from saltus.models.checks import FloatArray, covariance, numbers, probability, same
 from saltus.models.dependence import Matrix, TimeDependent, fixed, is_fixed, resolve
+from saltus.models.observer import Observer
 
-__all__ = ["SENSORS", "LinearSensor", "Measured", "PositionSensor", "Sensor"]
+__all__ = ["BoundSensor", "LinearSensor", "Measured", "PositionSensor", "Sensor", "at_time"]
 
 
 class Measured(NamedTuple):
@@ -45,8 +46,24 @@ class Sensor(Protocol):
         """Difference of measurements (angles wrapped)."""
         ...
 
-    def bind(self, chains: Sequence[Chain], n_state: int) -> "LinearSensor":
+    def bind(self, chains: Sequence[Chain], n_state: int) -> "BoundSensor":
         """Arrays with one mode axis per chain, for a state of dimension n."""
+        ...
+
+
+@runtime_checkable
+class BoundSensor(Sensor, Protocol):
+    """A sensor of one model: what depends on chains is an array with mode axes, and broadcasts against states.
+
+    A HybridModel keeps sensors in this form. LinearSensor is one, and every other that a filter linearises.
+    """
+
+    def at(self, t: float, observer: Observer | None = None) -> "BoundSensor":
+        """The sensor at a time, with the observer of that time if it moves: nothing then depends on time."""
+        ...
+
+    def noise(self) -> FloatArray:
+        """Noise covariance R, (M1|1, ..., MC|1, m, m), of a sensor at a time."""
         ...
 
 
@@ -75,7 +92,7 @@ class LinearSensor:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        _check_probability(self.prob_detection)
+        probability(self.prob_detection, "prob_detection")
         if is_fixed(self.H):
             put(self, "H", numbers(self.H, "LinearSensor H"))
             if np.ndim(fixed(self.H, "LinearSensor H")) < 2:
@@ -124,6 +141,19 @@ class LinearSensor:
             raise ModelError(f"LinearSensor H has {H.shape[-1]} columns, but the state has {n_state} components.")
         return bound
 
+    def at(self, t: float, observer: Observer | None = None) -> "LinearSensor":
+        """The sensor at one time; it has no observer."""
+        if observer is not None:
+            raise ModelError("a linear sensor has no observer: leave it out, or put its place into the offset d.")
+        if not any(isinstance(value, TimeDependent) for value in (self.H, self.R, self.d)):
+            return self
+        d = None if self.d is None else at_time(self.d, t)
+        return replace(self, H=at_time(self.H, t), R=at_time(self.R, t), d=d)
+
+    def noise(self) -> FloatArray:
+        """Noise covariance R with mode axes."""
+        return fixed(self.R, "LinearSensor R")
+
     def measured(self, t: FloatArray | None) -> Measured:
         """Matrices of a bound sensor; one per time (T,) where a function asks for `t`."""
         d = None if self.d is None else _at(self.d, "LinearSensor d", t)
@@ -151,7 +181,7 @@ class PositionSensor:
     prob_detection: float = 1.0
 
     def __post_init__(self) -> None:
-        _check_probability(self.prob_detection)
+        probability(self.prob_detection, "prob_detection")
         if not isinstance(self.dims, int) or self.dims < 1:
             raise ModelError(f"dims must be a positive whole number of axes, got {self.dims!r}.")
         if is_fixed(self.sigma):
@@ -210,15 +240,12 @@ class PositionSensor:
         return np.asarray(np.eye(n)[:: self._stride(n)])
 
 
-def _check_probability(prob: float) -> None:
-    if not 0 < prob <= 1:
-        raise ModelError(f"prob_detection must lie in (0, 1], got {prob!r}.")
+def at_time(value: Matrix, t: float) -> Matrix:
+    """Evaluate a bound value that may depend on time at one time: (M1|1, ..., MC|1, *core)."""
+    return value.at(np.array([t]), np.zeros(1))[0] if isinstance(value, TimeDependent) else value
 
 
 def _at(value: Matrix, what: str, t: FloatArray | None) -> FloatArray:
     if isinstance(value, TimeDependent):
         return value.at(t, np.zeros(1 if t is None else len(t)))
     return fixed(value, what)
-
-
-SENSORS = {name: globals()[name] for name in __all__ if name in globals() and is_dataclass(globals()[name])}
