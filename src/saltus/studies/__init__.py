@@ -7,6 +7,7 @@ from typing import Protocol
 
 from saltus.errors import ModelError
 from saltus.io.write import output_directory
+from saltus.studies.coloured_report import coloured_study
 from saltus.studies.radar_report import radar_study
 
 __all__ = ["STUDIES", "Study", "run_study"]
@@ -22,7 +23,7 @@ class Study(Protocol):
         ...
 
 
-STUDIES: dict[str, Study] = {"radar": radar_study}
+STUDIES: dict[str, Study] = {"coloured": coloured_study, "radar": radar_study}
 
 
 def run_study(
