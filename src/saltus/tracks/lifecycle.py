@@ -90,6 +90,28 @@ class Lifecycle:
         limit = np.where(self.status[rows] == CONFIRMED, self._coast_limit(rows), patience)
         return rows[now - self.time[rows] > limit + _SLACK * self.period[rows]]
 
+    def too_fast(self) -> _Rows:
+        """Return the rows, past their first plot, that move faster than any target by three deviations of speed."""
+        rows = self.rows()
+        rows = rows[self.status[rows] != SEED]
+        speed = np.hypot(self.mean[rows, 1], self.mean[rows, 3])
+        deviation = np.sqrt(self.cov[rows, 1, 1] + self.cov[rows, 3, 3])
+        return np.asarray(rows[speed - 3.0 * deviation > self._settings.max_speed])
+
+    def repeated(self) -> _Rows:
+        """Return the rows, past their first plot, whose address an older or surer row has: one aircraft, one track."""
+        rows = self.rows()
+        rows = rows[(self.status[rows] != SEED) & (self.icao24[rows] >= 0)]
+        rows = rows[np.lexsort((self.id[rows], -self.status[rows]))]
+        _, first = np.unique(self.icao24[rows], return_index=True)
+        return np.delete(rows, first)
+
+    def holds(self, icao24: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
+        """Say which addresses a row past its first plot has already."""
+        rows = self.rows()
+        taken = self.icao24[rows[self.status[rows] != SEED]]
+        return (icao24 >= 0) & np.isin(icao24, taken)
+
     def to_coast(self, now: float) -> tuple[_Rows, _Array]:
         """Count and return confirmed rows that missed one more plot by `now`, and the time it was expected."""
         rows = self.rows()

@@ -59,7 +59,7 @@ class TrackerSettings:
         detection_probability: probability that a target gives a plot in a scan.
         clutter_density: false plots and new targets per m^2 and scan; a higher value makes the tracker prefer
             leaving a distant plot alone to stretching a track.
-        max_speed: fastest target that may start a track, m/s.
+        max_speed: fastest target, m/s: no track starts faster, and one that becomes so is dropped.
         confirm_hits, confirm_scans: a track is confirmed when it got `confirm_hits` plots in the last
             `confirm_scans` expected ones (M of N).
         coast_scans: a confirmed track is dropped after so many expected plots missed in a row, but not before

@@ -72,6 +72,7 @@ class Assignments(NamedTuple):
 
     track_id: npt.NDArray[np.int64]  # (N,), 0 = none
     split: npt.NDArray[np.bool_]  # (N,): a second plot of a target already updated
+    elsewhere: npt.NDArray[np.bool_]  # (N,): far from the track that has its address
     confirmed: npt.NDArray[np.int64]  # ids of the tracks that were confirmed at some time
 
 
@@ -122,6 +123,7 @@ class Tracker:
         self._m, self._emit = measurements, emit
         self._track_id = np.zeros(len(measurements), np.int64)
         self._split = np.zeros(len(measurements), bool)
+        self._elsewhere = np.zeros(len(measurements), bool)
         for begin, end in self._slices():
             self._housekeep(float(measurements.time[begin]))
             sources = measurements.source[begin:end]
@@ -131,7 +133,7 @@ class Tracker:
             if progress is not None:
                 progress(end / len(measurements))
         confirmed = np.concatenate([np.zeros(0, np.int64), *self._confirmed])
-        return Assignments(self._track_id, self._split, np.unique(confirmed))
+        return Assignments(self._track_id, self._split, self._elsewhere, np.unique(confirmed))
 
     def _slices(self) -> Iterator[tuple[int, int]]:
         time = self._m.time
@@ -146,14 +148,15 @@ class Tracker:
             begin = end
 
     def _housekeep(self, now: float) -> None:
-        """Publish what coasts and drop what is overdue."""
+        """Publish what coasts; drop what is overdue or moves as no target does."""
         rows, expected = self._life.to_coast(now)
         while len(rows):
             self._publish_coasted(rows, expected)
             rows, expected = self._life.to_coast(now)
-        overdue = self._life.overdue(now)
-        self._kinematics.remove(overdue)
-        self._life.end(overdue)
+        life = self._life
+        ended = np.unique(np.concatenate([life.overdue(now), life.too_fast(), life.repeated()]))
+        self._kinematics.remove(ended)
+        life.end(ended)
 
     def _scan(self, index: _Index, period: float) -> None:
         """Associate and absorb the plots of one source in one slice."""
@@ -214,11 +217,12 @@ class Tracker:
         self._confirmed.append(life.id[rows[fresh & (life.status[rows] == CONFIRMED)]])
 
     def _begin(self, plots: _Index, used: _Index, period: float) -> None:
-        """Mark split plots among those left over, and begin a track with every other one."""
+        """Mark plots left over that are split or contradict their address; begin a track with every other one."""
         m, life, settings = self._m, self._life, self._settings
         split = m.split_from(plots, used, settings.split_range, np.radians(settings.split_azimuth))
-        self._split[plots[split]] = True
-        plots = plots[~split]
+        elsewhere = life.holds(m.icao24[plots]) & self._use_identity & ~split
+        self._split[plots[split]], self._elsewhere[plots[elsewhere]] = True, True
+        plots = plots[~split & ~elsewhere]
         mean, cov = np.zeros((len(plots), 6)), np.zeros((len(plots), 6, 6))
         mean[:, 0::2], cov[:, 0::2, 0::2] = m.with_height(plots, settings.height_prior)
         cov[:, [1, 3], [1, 3]] = self._seed_speed**2
