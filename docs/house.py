@@ -9,6 +9,7 @@ WORDS = {
     "demo": "two simulated radars, written, tracked and scored",
     "run": "recordings to tracks",
     "info": "what is in a recording",
+    "score": "tracks against the truth",
     "report": "one page of HTML",
     "config": "the TOML configuration",
     "studies": "experiments that measure the filters",

@@ -80,6 +80,18 @@ def track(
 
 
 @main.command()
+@click.argument("output", type=_FILE)
+@click.argument("truth", type=_FILE)
+@click.option("--json", "json_path", type=_FILE, help="Write the figures to this file.")
+@click.option("--cutoff", type=click.FloatRange(min=0, min_open=True), default=20.0, show_default=True, metavar="M")
+def score(output: Path, truth: Path, json_path: Path | None, cutoff: float) -> None:
+    """Score the tracks in OUTPUT against the table TRUTH: time, target_id, latitude, longitude."""
+    from saltus.score import score_files
+
+    score_files(output, truth, json_path, cutoff)
+
+
+@main.command()
 @click.argument("name")
 @click.option("-o", "--output", required=True, type=_FILE, help="Output directory.")
 @click.option("--runs", type=click.IntRange(min=2), help="Monte-Carlo runs (default: the study's own).")
