@@ -13,19 +13,22 @@ Garcia-Fernandez, Svensson, Morelande and Sarkka (2015), Posterior linearization
 that is Gauss-Newton steps towards the posterior mode (Bell and Cathey 1993).
 """
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from saltus.errors import ModelError
+from saltus.errors import ModelError, NumericalError
 from saltus.filters import steps
+from saltus.linalg import gaussian_terms
 from saltus.models import BoundSensor
 
 __all__ = ["Affine", "Linearisation", "cholesky", "linearise", "sensor_joint", "sensor_update"]
 
 Linearisation: TypeAlias = Literal["extended", "cubature"]
 
+_HALVINGS = 5  # of a Gauss-Newton step
 _DEAD = 1e-14  # part of a variance, left by the components before it, that counts as round-off
 
 
@@ -111,7 +114,9 @@ def sensor_update(
 ) -> tuple[steps.Joint, steps.Conditioned]:
     """Condition each mode on a measurement, linearised about its prediction and then about its own posterior.
 
-    The log-likelihood is that of the last linearisation; for tangents at the posterior mode this is Laplace's
+    Repeated tangents are Gauss-Newton steps for V(x) = |z - h(x)|^2_R + |x - m|^2_P, twice the negative log posterior.
+    Close to the observer a full step may jump far away, so of a step and its halves that one is taken which lowers V
+    most. The log-likelihood is that of the last linearisation; for tangents at the posterior mode this is Laplace's
     approximation of log f(z).
 
     Args:
@@ -128,14 +133,23 @@ def sensor_update(
 
     Raises:
         ModelError: the method has another name.
-        NumericalError: an innovation covariance is not positive definite, or the sensor has no derivative at a mean.
+        NumericalError: an innovation covariance is not positive definite, the sensor has no derivative at a mean, or
+            (tangents taken anew) a sensor's R is singular.
     """
     first = _predict(means, covs, _near(linearise(means, covs, sensor, method), sensor, z, seen))
     done = steps.condition(first, z, seen)
+    if iterations == 1:
+        return first, done
+
+    def step(x: Float[np.ndarray, "*lead n"], to: Float[np.ndarray, "*lead n"]) -> Float[np.ndarray, "*lead n"]:
+        return _shortened(x, to, lambda at: _misfit(at, means, covs, sensor, z, seen)) if method == "extended" else to
+
+    x = means
     for _ in range(iterations - 1):
-        again = _near(linearise(done.mean, done.cov, sensor, method), sensor, z, seen)
+        x = step(x, done.mean)
+        again = _near(linearise(x, done.cov, sensor, method), sensor, z, seen)
         done = steps.condition(_predict(means, covs, again), z, seen)
-    return first, done
+    return first, done._replace(mean=step(x, done.mean))
 
 
 def cholesky(covs: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
@@ -172,6 +186,39 @@ def _near(
 ) -> Affine:
     """Move y to the branch of angles nearest z, so that plain differences are the sensor's."""
     return affine._replace(y=np.where(seen, z - sensor.residual(z, affine.y), affine.y))
+
+
+def _misfit(
+    x: Float[np.ndarray, "*lead n"],
+    means: Float[np.ndarray, "*lead n"],
+    covs: Float[np.ndarray, "*lead n n"],
+    sensor: BoundSensor,
+    z: Float[np.ndarray, "*_z m"],
+    seen: Bool[np.ndarray, "*_z m"],
+) -> Float[np.ndarray, "*lead"]:
+    """Twice the negative log posterior of states x, but for a constant."""
+    u = np.linalg.solve(_regular(cholesky(covs)), (x - means)[..., None])[..., 0]
+    nu = np.where(seen, sensor.residual(z, sensor.h(x)), 0.0)
+    unseen = np.eye(z.shape[-1]) * ~seen[..., None]
+    R = sensor.noise() * (seen[..., :, None] & seen[..., None, :]) + unseen
+    try:
+        return np.asarray(gaussian_terms(nu, R)[0] + np.sum(u * u, axis=-1))
+    except np.linalg.LinAlgError as error:
+        raise NumericalError(
+            "an iterated update weighs what is left of a measurement by R^-1, but R is singular. "
+            "Give every measured component a positive variance, or use iterations=1."
+        ) from error
+
+
+def _shortened(
+    x: Float[np.ndarray, "*lead n"],
+    to: Float[np.ndarray, "*lead n"],
+    misfit: Callable[[Float[np.ndarray, "*lead n"]], Float[np.ndarray, "*lead"]],
+) -> Float[np.ndarray, "*lead n"]:
+    """The point of least misfit among the ends of the whole step from x, half of it, a quarter, ..., and x itself."""
+    points = np.stack([*(x + (to - x) * 0.5**halved for halved in range(_HALVINGS + 1)), x])
+    best = np.argmin(np.stack([misfit(point) for point in points]), axis=0)
+    return np.asarray(np.take_along_axis(points, best[None, ..., None], axis=0)[0])
 
 
 def _predict(means: Float[np.ndarray, "*lead n"], covs: Float[np.ndarray, "*lead n n"], affine: Affine) -> steps.Joint:
