@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["gaussian_terms", "logsumexp", "quadratic_form", "symmetric"]
+__all__ = ["block_diagonal", "gaussian_terms", "logsumexp", "quadratic_form", "symmetric"]
 
 
 def symmetric(a: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
@@ -42,3 +42,13 @@ def gaussian_terms(
     white = (L_inv @ nu[..., None])[..., 0]
     logdet = 2.0 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
     return np.asarray(np.sum(white * white, axis=-1)), np.asarray(logdet), L_inv  # arrays without leading axes too
+
+
+def block_diagonal(*blocks: Float[np.ndarray, "..."]) -> Float[np.ndarray, "*lead p p"]:
+    """Set square matrices (..., n_i, n_i) along the diagonal; leading axes broadcast from the right."""
+    lead = np.broadcast_shapes(*(a.shape[:-2] for a in blocks))
+    ends = np.cumsum([a.shape[-1] for a in blocks])
+    out = np.zeros((*lead, ends[-1], ends[-1]))
+    for a, end in zip(blocks, ends, strict=True):
+        out[..., end - a.shape[-1] : end, end - a.shape[-1] : end] = a
+    return out

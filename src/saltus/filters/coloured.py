@@ -20,7 +20,7 @@ from saltus.filters.coloured_model import Augmented, Differenced, augment, diffe
 from saltus.filters.estimates import Estimates
 from saltus.filters.imm import imm_filter
 
-__all__ = ["augmented_filter", "coloured_filter", "run_augmented", "run_differenced"]
+__all__ = ["after_first", "augmented_filter", "coloured_filter", "run_augmented", "run_differenced"]
 
 _Array = npt.NDArray[np.float64]
 _Index = tuple[slice | int, ...]
@@ -90,7 +90,7 @@ def coloured_filter(
         F=F, G=G, noise_F=noise_F, noise_G=noise_G, H=H, dt=dt, n_steps=measured.shape[-2] - 1,
         n_chains=len(trans), mean0=mean0, cov0=cov0, noise_cov0=noise_cov0,
     )  # fmt: skip
-    return run_differenced(measured, described, trans, probs0, per_mode=per_mode)
+    return after_first(run_differenced(measured, described, trans, probs0, per_mode=per_mode))
 
 
 def augmented_filter(
@@ -140,7 +140,7 @@ def run_augmented(
         ModelError, DataError, NumericalError: as `augmented_filter`.
     """
     data = _read(z, model, trans, probs0, R)
-    first, log_start = _start(data, np.eye(model.F.shape[-1]))
+    first, log_start, _ = _start(data, np.eye(model.F.shape[-1]))
     done = imm_filter(
         data.z[..., 1:, :],
         F=model.F,
@@ -173,7 +173,10 @@ def run_differenced(
     *,
     per_mode: bool = False,
 ) -> Estimates:
-    """Filter the state, and what of the noise is not seen, from the first sample on; the estimates are those of x.
+    """Filter the state, and what of the noise is not seen, from the first sample on.
+
+    Returns:
+        Estimates of x with one row per row of z, the first included.
 
     Raises:
         ModelError, DataError, NumericalError: as `coloured_filter`.
@@ -183,10 +186,11 @@ def run_differenced(
     out, n = _allocate(data, model.n_state, per_mode), model.n_state
     runs = (slice(None),) * (data.z.ndim - 2)
     try:
-        belief, out.log_likelihood_start[...] = _start(data, moves.T[: moves.n_kept] if data.complete[0] else moves.T)
+        belief, log_f, d2 = _start(data, moves.T[: moves.n_kept] if data.complete[0] else moves.T)
         belief = _pin(belief, data, 0, moves.n_kept)
-        for k in range(data.z.shape[-2] - 1):
-            belief, log_f, d2 = _step(data, moves, belief, k)
+        for k in range(data.z.shape[-2]):
+            if k > 0:
+                belief, log_f, d2 = _step(data, moves, belief, k - 1)
             at: _Index = (*runs, k)
             out.probs[at], out.log_likelihood[at], out.nis[at] = np.exp(belief.log_probs), log_f, d2
             means, covs = belief.means[..., :n], belief.covs[..., :n, :n]
@@ -196,6 +200,27 @@ def run_differenced(
     except NumericalError as error:
         raise NumericalError(_NO_NOISE) from error
     return out
+
+
+def after_first(est: Estimates) -> Estimates:
+    """Drop the row of the first sample; its log-likelihood becomes log_likelihood_start."""
+    lead = est.mean.ndim - 2
+
+    def rest(a: _Array) -> _Array:
+        return a[(slice(None),) * lead + (slice(1, None),)]
+
+    return replace(
+        est,
+        probs=rest(est.probs),
+        mean=rest(est.mean),
+        cov=rest(est.cov),
+        log_likelihood=rest(est.log_likelihood),
+        log_likelihood_start=np.asarray(est.log_likelihood[..., 0]),
+        nis=rest(est.nis),
+        n_observed=rest(est.n_observed),
+        mode_means=None if est.mode_means is None else rest(est.mode_means),
+        mode_covs=None if est.mode_covs is None else rest(est.mode_covs),
+    )
 
 
 class _Data(NamedTuple):
@@ -248,8 +273,8 @@ def _read(
     return _Data(whole, seen, complete, aligned)
 
 
-def _start(data: _Data, A: _Array) -> tuple[steps.Belief, _Array]:
-    """Condition the prior of a = (x, u) on the first sample, and map it: s = A a. Return the belief and log f(z_0).
+def _start(data: _Data, A: _Array) -> tuple[steps.Belief, _Array, _Array]:
+    """Condition the prior of a = (x, u) on the first sample, and map it: s = A a. Return belief, log f(z_0), NIS.
 
     S = [H L] P0 [H L]' + R, per mode; the modes are reweighed by N(z_0; [H L] a_0, S).
     """
@@ -262,8 +287,16 @@ def _start(data: _Data, A: _Array) -> tuple[steps.Belief, _Array]:
     mean0, cov0 = np.broadcast_to(prior.mean0, (*lead, n)), np.broadcast_to(prior.cov0, (*lead, n, n))
     prediction = steps.joint(mean0, cov0, A, None, first(prior.H), None, N)
     done = steps.condition(prediction, *_per_mode(data, 0))
-    log_probs, log_f = steps.reweigh(np.broadcast_to(prior.log_probs0, lead), done.loglik, len(prior.sizes))
-    return steps.Belief(log_probs, done.mean, np.broadcast_to(done.cov, (*lead, p, p))), log_f
+    log_probs0 = np.broadcast_to(prior.log_probs0, lead)
+    d2 = _nis(log_probs0, prediction, data, 0)
+    log_probs, log_f = steps.reweigh(log_probs0, done.loglik, len(prior.sizes))
+    return steps.Belief(log_probs, done.mean, np.broadcast_to(done.cov, (*lead, p, p))), log_f, d2
+
+
+def _nis(log_probs: _Array, prediction: steps.Joint, data: _Data, k: int) -> _Array:
+    seen = data.seen[..., k, :]
+    z = np.where(seen, data.z[..., k, :], 0.0)
+    return steps.mixture_nis(log_probs, prediction, z, seen, len(data.aligned.trans))
 
 
 def _step(data: _Data, moves: Differenced, belief: steps.Belief, k: int) -> tuple[steps.Belief, _Array, _Array]:
@@ -288,8 +321,7 @@ def _step(data: _Data, moves: Differenced, belief: steps.Belief, k: int) -> tupl
     order = np.r_[np.arange(Phi.shape[-1])[into], np.arange(kept, Phi.shape[-1])]
     prediction = steps.joint(means, covs, A, b, C, d, B[..., order[:, None], order])
     done = steps.condition(prediction, *_per_mode(data, k + 1))
-    seen = data.seen[..., k + 1, :]
-    d2 = steps.mixture_nis(log_probs, prediction, np.where(seen, data.z[..., k + 1, :], 0.0), seen, len(model.trans))
+    d2 = _nis(log_probs, prediction, data, k + 1)
     log_probs, log_f = steps.reweigh(log_probs, done.loglik, len(model.trans))
     return _pin(steps.Belief(log_probs, done.mean, done.cov), data, k + 1, kept), log_f, d2
 
@@ -314,15 +346,15 @@ def _per_mode(data: _Data, k: int) -> tuple[_Array, npt.NDArray[np.bool_]]:
 
 def _allocate(data: _Data, n: int, per_mode: bool) -> Estimates:
     batch, sizes = data.z.shape[:-2], data.aligned.sizes
-    rows = (*batch, data.z.shape[-2] - 1)
+    rows = (*batch, data.z.shape[-2])
     return Estimates(
         probs=np.empty((*rows, *sizes)),
         mean=np.empty((*rows, n)),
         cov=np.empty((*rows, n, n)),
         log_likelihood=np.empty(rows),
-        log_likelihood_start=np.empty(batch),
+        log_likelihood_start=np.zeros(batch),
         nis=np.empty(rows),
-        n_observed=data.seen[..., 1:, :].sum(-1).astype(float),
+        n_observed=data.seen.sum(-1).astype(float),
         mode_means=np.empty((*rows, *sizes, n)) if per_mode else None,
         mode_covs=np.empty((*rows, *sizes, n, n)) if per_mode else None,
     )

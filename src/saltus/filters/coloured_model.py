@@ -18,13 +18,13 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError, ModelError
+from saltus.linalg import block_diagonal
 from saltus.models import discretise
 from saltus.models.checks import FloatArray, covariance, intervals, numbers
 
-__all__ = ["Augmented", "Differenced", "augment", "block_diagonal", "difference"]
+__all__ = ["Augmented", "Differenced", "augment", "difference"]
 
 
 class Augmented(NamedTuple):
@@ -162,13 +162,3 @@ def _move(
     lengths, which = np.unique(dt.ravel(), return_inverse=True)
     Phi, Q = discretise(f, g, lengths.reshape(-1, *dt.shape[1:]))
     return Phi[which], Q[which]
-
-
-def block_diagonal(*blocks: Float[np.ndarray, "..."]) -> Float[np.ndarray, "*lead p p"]:
-    """Set square matrices (..., n_i, n_i) along the diagonal; leading axes broadcast from the right."""
-    lead = np.broadcast_shapes(*(a.shape[:-2] for a in blocks))
-    ends = np.cumsum([a.shape[-1] for a in blocks])
-    out = np.zeros((*lead, ends[-1], ends[-1]))
-    for a, end in zip(blocks, ends, strict=True):
-        out[..., end - a.shape[-1] : end, end - a.shape[-1] : end] = a
-    return out

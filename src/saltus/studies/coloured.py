@@ -18,8 +18,9 @@ from jaxtyping import Float
 
 from saltus import montecarlo
 from saltus.filters import Estimates, coloured_filter, imm_filter
-from saltus.filters.coloured import run_differenced
-from saltus.filters.coloured_model import Augmented, block_diagonal
+from saltus.filters.coloured import after_first, run_differenced
+from saltus.filters.coloured_model import Augmented
+from saltus.linalg import block_diagonal
 from saltus.metrics.estimation import nees
 from saltus.models import discretise
 
@@ -205,7 +206,7 @@ def _told(z: _Array, first: _Modes, modes: _Modes, rate: float) -> Estimates:
     F = np.broadcast_to(block_diagonal(x[0][0, 0], w[0][0, 0]), Q.shape)
     cov0 = block_diagonal(model["cov0"], model["noise_cov0"][0, first[:, 1]])
     described = Augmented(F, Q, None, model["H"], np.eye(1), np.zeros(3), cov0)
-    return run_differenced(z, described, [], 1.0)
+    return after_first(run_differenced(z, described, [], 1.0))
 
 
 def _white(z: _Array, model: dict[str, _Array]) -> Estimates:
@@ -228,12 +229,4 @@ def _white(z: _Array, model: dict[str, _Array]) -> Estimates:
         cov0=model["cov0"],
         probs0=np.full((2, 2), 0.25),
     )
-    return Estimates(
-        probs=est.probs[:, 1:],
-        mean=est.mean[:, 1:],
-        cov=est.cov[:, 1:],
-        log_likelihood=est.log_likelihood[:, 1:],
-        log_likelihood_start=est.log_likelihood[:, 0],
-        nis=est.nis[:, 1:],
-        n_observed=est.n_observed[:, 1:],
-    )
+    return after_first(est)
