@@ -5,6 +5,7 @@ from dataclasses import is_dataclass
 from saltus.models import nonlinear, polar, sensors
 from saltus.models.arrays import Arrays, Layout
 from saltus.models.chain import Chain
+from saltus.models.conditions import OK, Condition, FaultySensor, lost, outliers
 from saltus.models.dynamics import Dynamics, LinearSDE, LinearTransition, Step
 from saltus.models.exponential import discretise, exponential
 from saltus.models.findings import Finding
@@ -17,11 +18,14 @@ from saltus.models.polar import PolarSensor
 from saltus.models.sensors import BoundSensor, LinearSensor, PositionSensor, Sensor
 
 __all__ = [
+    "OK",
     "SENSORS",
     "Arrays",
     "BoundSensor",
     "Chain",
+    "Condition",
     "Dynamics",
+    "FaultySensor",
     "Finding",
     "FunctionSensor",
     "Gaussian",
@@ -40,6 +44,8 @@ __all__ = [
     "constant_velocity",
     "discretise",
     "exponential",
+    "lost",
+    "outliers",
     "singer",
 ]
 
