@@ -8,6 +8,7 @@ from typing import Protocol
 from saltus.errors import ModelError
 from saltus.io.write import output_directory
 from saltus.studies.coloured_report import coloured_study
+from saltus.studies.fusion_report import fusion_study
 from saltus.studies.radar_report import radar_study
 
 __all__ = ["STUDIES", "Study", "run_study"]
@@ -23,7 +24,7 @@ class Study(Protocol):
         ...
 
 
-STUDIES: dict[str, Study] = {"coloured": coloured_study, "radar": radar_study}
+STUDIES: dict[str, Study] = {"coloured": coloured_study, "fusion": fusion_study, "radar": radar_study}
 
 
 def run_study(
