@@ -202,7 +202,7 @@ def _misfit(
     unseen = np.eye(z.shape[-1]) * ~seen[..., None]
     R = sensor.noise() * (seen[..., :, None] & seen[..., None, :]) + unseen
     try:
-        return np.asarray(gaussian_terms(nu, R)[0] + np.sum(u * u, axis=-1))
+        return np.asarray(gaussian_terms(nu, np.broadcast_to(R, (*nu.shape, nu.shape[-1])))[0] + np.sum(u * u, axis=-1))
     except np.linalg.LinAlgError as error:
         raise NumericalError(
             "an iterated update weighs what is left of a measurement by R^-1, but R is singular. "
