@@ -110,7 +110,7 @@ class IMM:
         arrays = model.compile(times=times, sensor=())
         sizes, n = arrays.probs0.shape, model.n_state
         with np.errstate(divide="ignore"):
-            log_probs = np.log(arrays.probs0)
+            log_probs = np.asarray(np.log(arrays.probs0))
         belief = steps.Belief(
             log_probs, np.broadcast_to(arrays.mean0, (*sizes, n)), np.broadcast_to(arrays.cov0, (*sizes, n, n))
         )
