@@ -8,11 +8,13 @@ from saltus.models import (
     SENSORS,
     BoundSensor,
     Chain,
+    ColouredSensor,
     FunctionSensor,
     LinearSensor,
     Observer,
     PolarSensor,
     PositionSensor,
+    second_order,
 )
 
 
@@ -22,6 +24,7 @@ def squares(x):
 
 EXAMPLES = {
     "LinearSensor": [LinearSensor(H=[[1.0, 0, 2, 0]], R=[[4.0]], d=[3.0], prob_detection=0.9)],
+    "ColouredSensor": [ColouredSensor(H=[[1.0, 0, 2, 0]], noise_model=second_order(5.0, 3.0), d=[3.0])],
     "PositionSensor": [PositionSensor(dims=2, sigma=[3.0, 5.0])],
     "PolarSensor": [
         PolarSensor(sigma_range=30.0, sigma_azimuth=0.01, sigma_range_rate=2.0, offset=[5.0, 0.1, 1.0]),

@@ -20,7 +20,7 @@ from saltus.filters.coloured_model import Augmented, Differenced, augment, diffe
 from saltus.filters.estimates import Estimates
 from saltus.filters.imm import imm_filter
 
-__all__ = ["after_first", "augmented_filter", "coloured_filter", "run_augmented", "run_differenced"]
+__all__ = ["after_first", "augmented_filter", "coloured_filter", "of_state", "run_augmented", "run_differenced"]
 
 _Array = npt.NDArray[np.float64]
 _Index = tuple[slice | int, ...]
@@ -154,14 +154,17 @@ def run_augmented(
         probs0=np.exp(first.log_probs),
         per_mode=per_mode,
     )
-    x = slice(model.n_state)
+    return replace(of_state(done, model.n_state), log_likelihood_start=log_start)
+
+
+def of_state(est: Estimates, n: int) -> Estimates:
+    """Keep the first n components, those of x."""
     return replace(
-        done,
-        mean=done.mean[..., x],
-        cov=done.cov[..., x, x],
-        mode_means=None if done.mode_means is None else done.mode_means[..., x],
-        mode_covs=None if done.mode_covs is None else done.mode_covs[..., x, x],
-        log_likelihood_start=log_start,
+        est,
+        mean=est.mean[..., :n],
+        cov=est.cov[..., :n, :n],
+        mode_means=None if est.mode_means is None else est.mode_means[..., :n],
+        mode_covs=None if est.mode_covs is None else est.mode_covs[..., :n, :n],
     )
 
 

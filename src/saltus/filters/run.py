@@ -9,10 +9,12 @@ import numpy.typing as npt
 
 from saltus.errors import DataError, ModelError, SaltusError
 from saltus.filters import steps
+from saltus.filters.coloured_run import filter_coloured
 from saltus.filters.estimates import Estimates
 from saltus.filters.imm import imm_filter
 from saltus.filters.linearise import Linearisation, sensor_update
 from saltus.models import Arrays, BoundSensor, HybridModel, LinearSensor, Observer
+from saltus.models.augment import coloured_sensors
 
 __all__ = ["IMM", "Record"]
 
@@ -69,7 +71,8 @@ class IMM:
 
         The prior holds at the first record, unless it names a time. Records of the same time are separate rows with
         no interval between them. Records of linear sensors alone go through `imm_filter`; with a nonlinear one among
-        them they are taken one by one, linearised in each mode.
+        them they are taken one by one, linearised in each mode. With coloured noise `saltus.models.treatment`
+        says which way is taken; the estimates are those of the model's own state.
 
         Args:
             records: (time, sensor, values) each, and the observer for a sensor that moves; NaN is a missing component.
@@ -97,7 +100,14 @@ class IMM:
             )
         sensors = self.model.sensors
         plain = all(isinstance(sensors.get(r.sensor), LinearSensor | None) and r.observer is None for r in listed)
-        found = self._at_once(self.model, listed, times) if plain else self._one_by_one(self.model, listed, times)
+        if coloured_sensors(self.model):
+            moving = next((k for k, record in enumerate(listed) if record.observer is not None), None)
+            if moving is not None:
+                raise DataError(f"record {moving}: beside coloured noise sensors are linear and have no observer.")
+            names, values = [record.sensor for record in listed], [record.z for record in listed]
+            found = filter_coloured(self.model, names, values, times, per_mode=self.per_mode)
+        else:
+            found = self._at_once(self.model, listed, times) if plain else self._one_by_one(self.model, listed, times)
         return replace(found, chains=tuple(chain.name for chain in self.model.chains), times=times)
 
     def _at_once(self, model: HybridModel, records: Sequence[Record], times: _Array) -> Estimates:

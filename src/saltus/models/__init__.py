@@ -2,9 +2,11 @@
 
 from dataclasses import is_dataclass
 
-from saltus.models import nonlinear, polar, sensors
+from saltus.models import coloured, nonlinear, polar, sensors
 from saltus.models.arrays import Arrays, Layout
+from saltus.models.augment import Treatment, augmented, treatment
 from saltus.models.chain import Chain
+from saltus.models.coloured import ColouredSensor
 from saltus.models.conditions import OK, Condition, FaultySensor, lost, outliers
 from saltus.models.dynamics import Dynamics, LinearSDE, LinearTransition, Step
 from saltus.models.exponential import discretise, exponential
@@ -12,6 +14,7 @@ from saltus.models.findings import Finding
 from saltus.models.gaussian import Gaussian
 from saltus.models.hybrid import HybridModel
 from saltus.models.motion import Motion, constant_acceleration, constant_velocity, singer
+from saltus.models.noise import MarkovNoise, first_order, second_order
 from saltus.models.nonlinear import FunctionSensor
 from saltus.models.observer import Observer
 from saltus.models.polar import PolarSensor
@@ -23,6 +26,7 @@ __all__ = [
     "Arrays",
     "BoundSensor",
     "Chain",
+    "ColouredSensor",
     "Condition",
     "Dynamics",
     "FaultySensor",
@@ -34,25 +38,31 @@ __all__ = [
     "LinearSDE",
     "LinearSensor",
     "LinearTransition",
+    "MarkovNoise",
     "Motion",
     "Observer",
     "PolarSensor",
     "PositionSensor",
     "Sensor",
     "Step",
+    "Treatment",
+    "augmented",
     "constant_acceleration",
     "constant_velocity",
     "discretise",
     "exponential",
+    "first_order",
     "lost",
     "outliers",
+    "second_order",
     "singer",
+    "treatment",
 ]
 
 # Every sensor: the dataclasses that the modules of sensors offer.
 SENSORS = {
     name: getattr(module, name)
-    for module in (sensors, polar, nonlinear)
+    for module in (sensors, polar, nonlinear, coloured)
     for name in module.__all__
     if is_dataclass(getattr(module, name))
 }

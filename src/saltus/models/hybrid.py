@@ -180,7 +180,8 @@ class HybridModel:
         if not isinstance(sensor, LinearSensor):
             raise ModelError(
                 f"sensor {name!r} is not linear: a {type(sensor).__name__} has no matrices.\n"
-                "IMM(model).run(records) linearises it; compile takes the linear ones with sensor=[...]."
+                "IMM(model).run(records) linearises it; compile takes the linear ones with sensor=[...], and where "
+                "its noise is coloured, augmented(model) compiles."
             )
         return sensor
 
