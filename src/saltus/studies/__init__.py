@@ -9,6 +9,7 @@ from saltus.errors import ModelError
 from saltus.io.write import output_directory
 from saltus.studies.coloured_report import coloured_study
 from saltus.studies.fusion_report import fusion_study
+from saltus.studies.jamming_report import jamming_study
 from saltus.studies.radar_report import radar_study
 
 __all__ = ["STUDIES", "Study", "run_study"]
@@ -24,7 +25,12 @@ class Study(Protocol):
         ...
 
 
-STUDIES: dict[str, Study] = {"coloured": coloured_study, "fusion": fusion_study, "radar": radar_study}
+STUDIES: dict[str, Study] = {
+    "coloured": coloured_study,
+    "fusion": fusion_study,
+    "jamming": jamming_study,
+    "radar": radar_study,
+}
 
 
 def run_study(
