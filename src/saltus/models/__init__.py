@@ -8,6 +8,7 @@ from saltus.models.augment import Treatment, augmented, treatment
 from saltus.models.chain import Chain
 from saltus.models.coloured import ColouredSensor
 from saltus.models.conditions import OK, Condition, FaultySensor, lost, outliers
+from saltus.models.drawing import diagram
 from saltus.models.dynamics import Dynamics, LinearSDE, LinearTransition, Step
 from saltus.models.exponential import discretise, exponential
 from saltus.models.findings import Finding
@@ -49,6 +50,7 @@ __all__ = [
     "augmented",
     "constant_acceleration",
     "constant_velocity",
+    "diagram",
     "discretise",
     "exponential",
     "first_order",
