@@ -12,7 +12,7 @@ from pyarrow import parquet
 from saltus.cli import main
 from saltus.config import SensorConfig, load_config
 from saltus.records import REASONS
-from saltus.tracks.output import ELSEWHERE, NOT_CONFIRMED, SINGLE, SPLIT
+from saltus.tracks.output import BEARING, ELSEWHERE, NOT_CONFIRMED, SINGLE, SPLIT
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -108,7 +108,7 @@ def test_columns_explained_are_the_columns_written(tmp_path, monkeypatch, capsys
 
 def test_every_reason_is_explained():
     section = TEXT["formats.md"].partition("### Why a report is not a plot")[2].partition("\n## ")[0]
-    wanted = {*REASONS, SPLIT, ELSEWHERE, SINGLE, NOT_CONFIRMED} - {"", "status message"}
+    wanted = {*REASONS, BEARING, SPLIT, ELSEWHERE, SINGLE, NOT_CONFIRMED} - {"", "status message"}
     assert set(cells(section)) == wanted
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from saltus.config import load_config
 from saltus.io import read
-from saltus.records import REASONS, Kind
+from saltus.records import Kind
 from saltus.report.places import plot_positions
 from saltus.run import track_files
 from saltus.score import score_files
@@ -61,8 +61,7 @@ def test_a_row_of_norths_and_a_row_of_easts(autoferry, tmp_path):
     np.testing.assert_allclose(plots.azimuth[bearing], [0.5, 2 * np.pi - 0.5, 3.0])
     names = np.array([s.system.name for s in plots.sources])[plots.source]
     assert names.tolist() == ["lidar", *["radar"] * 5, "ir", "eo", "eo"]
-    assert np.all(plots.reason[plane] == 0)
-    assert np.all(plots.reason[bearing] == REASONS.index("bearing alone"))
+    assert np.all(plots.reason == 0)
 
 
 def test_places_of_ship_and_truth(autoferry, tmp_path):
@@ -145,4 +144,4 @@ def test_a_recorded_scenario(autoferry, tmp_path, recordings):
 
 def test_the_configuration_is_read():
     config = load_config(EXAMPLES / "autoferry.toml")
-    assert [s.name for s in config.sensor] == ["radar", "lidar"]
+    assert [s.name for s in config.sensor] == ["radar", "lidar", "ir", "eo"]

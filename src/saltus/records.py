@@ -32,7 +32,6 @@ REASONS = (
     "outside time window",  # --from / --to
     "site unknown",  # the source needs a site position and none is configured
     "system track",  # CAT062: another system's track, never used as a plot
-    "bearing alone",  # a camera's: without a range it starts no track
 )
 
 

@@ -36,9 +36,10 @@ _Array = npt.NDArray[np.float64]
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 _NOISE_PLOTS = 5_000  # reports of each source that the noise is estimated from before tracking
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
-_SIGMAS = {  # by whether the source is polar: label, field of Noise, unit
-    True: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
-    False: (("sigma_xy_m", "xy", 1.0),),
+_SIGMAS = {  # by what a source reports: label, field of Noise, unit
+    Kind.POLAR: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
+    Kind.PLANE: (("sigma_xy_m", "xy", 1.0),),
+    Kind.BEARING: (("sigma_azimuth_deg", "azimuth", 180.0 / np.pi),),
 }
 
 
@@ -160,7 +161,7 @@ def _prepare(
         reason[usable & outside] = REASONS.index("outside time window")
     sensors = _sensors(plots.sources, recording, config)
     for s, source in enumerate(plots.sources):
-        needs = (plots.source == s) & ((plots.kind == Kind.POLAR) | (plots.kind == Kind.PLANE)) & (reason == 0)
+        needs = (plots.source == s) & np.isin(plots.kind, (Kind.POLAR, Kind.PLANE, Kind.BEARING)) & (reason == 0)
         needs &= np.isnan(plots.observer_latitude)
         if sensors.sites[s] is None and needs.any():
             reason[needs] = REASONS.index("site unknown")
@@ -258,8 +259,15 @@ def _steady_d2(rows: Sequence[Rows], m: Measurements, s: int) -> _Array:
 
 def _configured(plots: Plots, s: int, given: dict[str, float]) -> bool:
     """Say whether the configuration gives every standard deviation that the source's reports need."""
-    polar = bool(((plots.source == s) & (plots.kind == Kind.POLAR)).any())
-    return {"range", "azimuth"} <= set(given) if polar else "xy" in given
+    return {field for _, field, _ in _SIGMAS[_reports(plots, s)]} <= set(given)
+
+
+def _reports(plots: Plots, s: int) -> int:
+    """What a source reports: polar where any report is, bearings where nothing else is, else plane positions."""
+    kinds = plots.kind[(plots.source == s) & (plots.kind != Kind.NONE)]
+    if (kinds == Kind.POLAR).any():
+        return Kind.POLAR
+    return Kind.BEARING if len(kinds) and (kinds == Kind.BEARING).all() else Kind.PLANE
 
 
 def _first_stretch(plots: Plots) -> Plots:
@@ -334,9 +342,8 @@ def _noise_table(plots: Plots, sensors: _Sensors, tracked: _Tracked) -> dict[str
     for s, name in enumerate(sensors.names):
         at = (measurement >= 0) & (m.source[measurement] == s) & np.isfinite(d2)
         given, found, used = sensors.configured[s], tracked.estimates[s], tracked.noise[s]
-        polar = bool(((plots.source == s) & (plots.kind == Kind.POLAR)).any())
         row: dict[str, object] = {"system": str(plots.sources[s].system)}
-        for label, field, scale in _SIGMAS[polar]:
+        for label, field, scale in _SIGMAS[_reports(plots, s)]:
             row[label] = {
                 "configured": _rounded(given.get(field, np.nan) * scale),
                 "estimated": _rounded(getattr(found, field) * scale),

@@ -213,7 +213,7 @@ def test_kinds_stated_and_bearings(tmp_path):
     polar, plane, bearing = Kind.POLAR, Kind.PLANE, Kind.BEARING
     assert got.plots.kind.tolist() == [polar, plane, bearing, bearing, polar, polar]
     found = reasons(got)
-    assert [found[k] for k in (2, 3, 4)] == ["bearing alone", "bearing alone", "not a number"]
+    assert [found[k] for k in (2, 3, 4)] == ["", "", "not a number"]
     assert "row 5, column 'kind': 'sonar' is no kind" in got.problems[0]
 
 

@@ -47,6 +47,9 @@ def measured(time, xy, sigma, *, altitude=None, sigma_altitude=10.0, source=0, i
         polar=np.full((n, 2), np.nan),
         ray=np.full((n, 2), np.nan),
         lever=np.zeros((n, 2)),
+        origin=np.full((n, 2), np.nan),
+        bearing=np.full(n, np.nan),
+        sigma_bearing=np.full(n, np.nan),
     )
 
 

@@ -88,7 +88,6 @@ def _mark_values(plots: Plots, reason: npt.NDArray[np.int8]) -> None:
         outside |= _outside(plots, name)
     _mark(reason, not_number, "not a number")
     _mark(reason, outside, "out of range")
-    _mark(reason, plots.kind == Kind.BEARING, "bearing alone")
 
 
 def _outside(plots: Plots, name: str) -> npt.NDArray[np.bool_]:

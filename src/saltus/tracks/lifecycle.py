@@ -39,6 +39,7 @@ class Lifecycle:
         self.id = np.zeros(0, np.int64)
         self.status = np.zeros(0, np.int8)
         self.time = np.zeros(0)  # of the last update, s
+        self.located = np.zeros(0)  # of the last one that was more than a bearing, s
         self.mean = np.zeros((0, 6))  # state then: x, vx, y, vy, z, vz in the plane
         self.cov = np.zeros((0, 6, 6))
         self.period = np.zeros(0)  # shortest update period of the sources that saw the track, s
@@ -63,6 +64,7 @@ class Lifecycle:
         self.status[rows] = SEED
         self.time[rows], self.period[rows], self.plot[rows] = birth[:3]
         self.mean[rows], self.cov[rows] = birth[3:]
+        self.located[rows] = birth.time
         self.history[rows] = 1
         self.coasted[rows] = 0
         self.has_altitude[rows] = False
@@ -72,7 +74,7 @@ class Lifecycle:
         """Enter a plot for each row; confirm what has M plots of the last N expected."""
         settings = self._settings
         self.period[rows] = np.minimum(self.period[rows], period)
-        scans = np.rint((time - self.time[rows]) / self.period[rows])
+        scans = np.rint((time - self.located[rows]) / self.period[rows])
         shift = np.clip(scans, 1, 63).astype(np.uint64)
         self.history[rows] = (self.history[rows] << shift) | np.uint64(1)
         window = np.uint64((1 << settings.confirm_scans) - 1)
@@ -80,15 +82,21 @@ class Lifecycle:
         enough = hits >= settings.confirm_hits
         self.status[rows] = np.where(enough | (self.status[rows] == CONFIRMED), CONFIRMED, TENTATIVE)
         self.time[rows] = np.maximum(self.time[rows], time)
+        self.located[rows] = np.maximum(self.located[rows], time)
         self.coasted[rows] = 0
         self.plot[rows] = plot
+
+    def sighted(self, rows: _Rows, time: _Array) -> None:
+        """Enter a bearing for each row: it moves the state, and neither confirms the track nor keeps it alive."""
+        self.time[rows] = np.maximum(self.time[rows], time)
+        self.coasted[rows] = 0
 
     def overdue(self, now: float) -> _Rows:
         """Return the rows that have missed too much by `now`: coasted out, or not confirmable any more."""
         settings, rows = self._settings, self.rows()
         patience = (settings.confirm_scans - settings.confirm_hits + 1) * self.period[rows]
         limit = np.where(self.status[rows] == CONFIRMED, self._coast_limit(rows), patience)
-        return rows[now - self.time[rows] > limit + _SLACK * self.period[rows]]
+        return rows[now - self.located[rows] > limit + _SLACK * self.period[rows]]
 
     def too_fast(self) -> _Rows:
         """Return the rows, past their first plot, that move faster than any target by three deviations of speed."""

@@ -72,6 +72,9 @@ class Measurements:
     polar: _Array  # (N, 2): slant range (m) and azimuth (rad) where the source measures them, else NaN
     ray: _Array  # (N, 2): from the site to the position in the plane, m; NaN where the source is not polar
     lever: _Array  # (N, 2): change of plane position per metre of height error, 0 where none
+    origin: _Array  # (N, 2): plane x, y of the observer of a bearing, m; NaN where there is a position instead
+    bearing: _Array  # (N,): rad from the plane's y axis, clockwise; NaN likewise
+    sigma_bearing: _Array  # (N,): rad; NaN likewise
 
     def __len__(self) -> int:
         """Number of measurements."""
@@ -175,11 +178,17 @@ def place_plots(
     n = len(usable)
     position, cov = np.full((n, 3), np.nan), np.zeros((n, 3, 3))
     lever, ray = np.zeros((n, 2)), np.full((n, 2), np.nan)
+    sights = np.full((n, 4), np.nan)
     moved = np.isfinite(plots.observer_latitude[usable])
-    for s, kind, moves in product(range(len(plots.sources)), (Kind.POLAR, Kind.PLANE, Kind.GEODETIC), (False, True)):
+    kinds = (Kind.POLAR, Kind.PLANE, Kind.GEODETIC, Kind.BEARING)
+    for s, kind, moves in product(range(len(plots.sources)), kinds, (False, True)):
         at = np.flatnonzero((plots.source[usable] == s) & (plots.kind[usable] == kind) & (moved == moves))
-        if len(at):
-            own = plots.take(usable[at])
+        if not len(at):
+            continue
+        own = plots.take(usable[at])
+        if kind == Kind.BEARING:
+            sights[at] = _sights(own, plane, sites[s], noise[s])
+        else:
             placed = _place(own, kind, plane, sites[s], noise[s], height_prior)
             _fill(position, cov, lever, at, placed)
             site = _site(own, sites[s])
@@ -197,6 +206,9 @@ def place_plots(
         polar=np.stack([plots.range[usable], plots.azimuth[usable]], axis=-1),
         ray=ray,
         lever=lever,
+        origin=sights[:, :2],
+        bearing=sights[:, 2],
+        sigma_bearing=sights[:, 3],
     )
 
 
@@ -245,6 +257,16 @@ def _place(
     for column, values in zip(flat, solid, strict=True):
         column[measured] = values
     return flat
+
+
+def _sights(plots: Plots, plane: Plane, fixed: Site | None, noise: Noise) -> _Array:
+    """Where bearings were taken from (plane x, y), their directions in the plane and deviations, (k, 4)."""
+    site = _site(plots, fixed)
+    if site is None:
+        raise DataError("internal: a bearing from an unknown site reached the tracker")
+    convergence, _ = plane.factors_at(site.latitude, site.longitude)
+    origin = np.broadcast_to(plane.forward(site.latitude, site.longitude), (len(plots), 2))
+    return np.column_stack([origin, plots.azimuth - convergence, np.full(len(plots), noise.azimuth)])
 
 
 def _height(plots: Plots, site: Site | Sites) -> _Array:

@@ -12,12 +12,22 @@ from saltus.tracks.lifecycle import STATUS
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.tracker import Assignments, Rows
 
-__all__ = ["ELSEWHERE", "NOT_CONFIRMED", "SINGLE", "SPLIT", "assignment_table", "innovation_table", "track_table"]
+__all__ = [
+    "BEARING",
+    "ELSEWHERE",
+    "NOT_CONFIRMED",
+    "SINGLE",
+    "SPLIT",
+    "assignment_table",
+    "innovation_table",
+    "track_table",
+]
 
 _Array = npt.NDArray[np.float64]
 
 SPLIT = "split plot"
 ELSEWHERE = "address elsewhere"  # far from the track that has its address
+BEARING = "bearing alone"  # in no confirmed track's direction: it starts none
 SINGLE = "single plot"  # no second plot near it
 NOT_CONFIRMED = "track not confirmed"
 
@@ -97,7 +107,10 @@ def assignment_table(plots: Plots, m: Measurements, assignments: Assignments) ->
     kept = np.isin(ids, assignments.confirmed)
     track_id[m.plot] = np.where(kept, ids, 0)
     single = np.bincount(ids)[ids] == 1 if len(ids) else np.zeros(0, bool)
-    why = np.select([assignments.split, assignments.elsewhere, single], [SPLIT, ELSEWHERE, SINGLE], NOT_CONFIRMED)
+    alone = np.isfinite(m.bearing)
+    why = np.select(
+        [alone, assignments.split, assignments.elsewhere, single], [BEARING, SPLIT, ELSEWHERE, SINGLE], NOT_CONFIRMED
+    )
     reason[m.plot] = np.where(kept, "", why)
     sources = np.array([-1 if s.system.category is None else s.system.category for s in plots.sources] or [-1])
     category = sources[plots.source]

@@ -59,6 +59,8 @@ class TrackerSettings:
         detection_probability: probability that a target gives a plot in a scan.
         clutter_density: false plots and new targets per m^2 and scan; a higher value makes the tracker prefer
             leaving a distant plot alone to stretching a track.
+        clutter_density_azimuth: false bearings and other objects per radian and scan, of sources that give bearings
+            alone.
         max_speed: fastest target, m/s: no track starts faster, and one that becomes so is dropped.
         confirm_hits, confirm_scans: a track is confirmed when it got `confirm_hits` plots in the last
             `confirm_scans` expected ones (M of N).
@@ -83,6 +85,7 @@ class TrackerSettings:
     gate_probability: float = 0.9999
     detection_probability: float = 0.95
     clutter_density: float = 1e-11
+    clutter_density_azimuth: float = 1.0
     max_speed: float = 400.0
     confirm_hits: int = 3
     confirm_scans: int = 5
@@ -109,6 +112,7 @@ class TrackerSettings:
                 f"tracker.confirm_hits of confirm_scans (M of N) needs 1 <= M <= N <= 32, "
                 f"got {self.confirm_hits} of {self.confirm_scans}."
             )
-        for name in ("clutter_density", "max_speed", "coast_scans", "coast_seconds", "split_range", "split_azimuth"):
+        positive = ("clutter_density", "clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds")
+        for name in (*positive, "split_range", "split_azimuth"):
             if not getattr(self, name) > 0:
                 raise ModelError(f"tracker.{name} must be positive, got {getattr(self, name)}.")

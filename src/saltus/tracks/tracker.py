@@ -13,6 +13,7 @@ from saltus.tracks.kinematics import Moments, Start, make_kinematics, two_point_
 from saltus.tracks.lifecycle import COASTED, CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.sights import sight
 
 __all__ = ["Assignments", "Rows", "Tracker", "join_rows"]
 
@@ -161,6 +162,12 @@ class Tracker:
     def _scan(self, index: _Index, period: float) -> None:
         """Associate and absorb the plots of one source in one slice."""
         life = self._life
+        bearings = np.isfinite(self._m.bearing[index])
+        if bearings.any():
+            self._sight(index[bearings])
+            index = index[~bearings]
+            if not len(index):
+                return
         gated = self._gate(self._kinematics, life, self._m, index)
         log_f = gated.copies.update(gated.copy, gated.plan)
         chosen = assign(gated.pairs, self._gain(gated, index, log_f))
@@ -174,6 +181,20 @@ class Tracker:
         self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2)
         left = np.setdiff1d(np.arange(len(index)), gated.pairs.plot[chosen])
         self._begin(index[left], plots[life.status[rows] == CONFIRMED], period)
+
+    def _sight(self, index: _Index) -> None:
+        """Absorb the bearings of one source in one slice: they update confirmed tracks, and do nothing else."""
+        settings, m, life = self._settings, self._m, self._life
+        seen = sight(self._kinematics, life, m, index, self._gate.height)
+        log_f = seen.copies.update(seen.copy, seen.plan) + seen.log_scale
+        detection = settings.detection_probability
+        gain = log_f - np.log(settings.clutter_density_azimuth) + np.log(detection / (1.0 - detection))
+        chosen = assign(seen.pairs, gain)
+        rows, plots = seen.pairs.track[chosen], index[seen.pairs.plot[chosen]]
+        self._kinematics.put(rows, seen.copies, seen.copy[chosen])
+        life.sighted(rows, m.time[plots])
+        self._track_id[plots] = life.id[rows]
+        self._publish(rows, plots, seen.centre[chosen], seen.cov[chosen], np.full(len(rows), np.nan))
 
     def _gain(self, gated: Gated, index: _Index, log_f: _Array) -> _Array:
         """Log-likelihood ratio of "this plot is this track's" against "the track missed and the plot is new"."""
