@@ -1,6 +1,8 @@
 """What a drawing says, against the description it was made from."""
 
+import re
 import xml.etree.ElementTree as ET
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -86,3 +88,13 @@ def test_long_names_are_cut():
     long = Chain("a_name_that_goes_on_and_on_and_on_and_on", ["one", "two"], stay=0.9)
     words = texts(diagram(model(long, radar=PositionSensor(2, 1.0))))
     assert any(w.startswith("a_name_that_goes") and w.endswith("…") for w in words)
+
+
+def test_the_picture_of_the_documentation_is_the_one_its_page_draws(tmp_path, monkeypatch):
+    docs = Path(__file__).parents[2] / "docs"
+    page = (docs / "decisions.md").read_text(encoding="utf-8")
+    first, *_, last = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    described = first[: first.index("arrays =")]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(described + last, "decisions.md", "exec"), {})
+    assert (tmp_path / "model.svg").read_text("utf-8") == (docs / "images/model.svg").read_text("utf-8")

@@ -79,7 +79,7 @@ def diagram(model: HybridModel) -> str:
     steps = [
         ("mix", f"{len(chains)} chain{'s' if len(chains) != 1 else ''}, one after the other"),
         (f"predict in {model.n_modes} channel{plural}", f"{sizes}: one per joint mode"),
-        ("correct", "each channel, by the sensor that measured"),
+        ("correct", "by the sensor that measured"),
         ("reweigh the modes", "Bayes' rule, in logs"),
         ("collapse", "mean, covariance, P(modes)"),
     ]
