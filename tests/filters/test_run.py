@@ -145,7 +145,7 @@ def bearings_only(rng, sites_of):
     dynamics = constant_velocity(2, accel=0.01)
     model = HybridModel([], dynamics, {name: PolarSensor(sigma_azimuth=sigma) for name in names}, prior)
     nees, spread = [], []
-    for _ in range(10):
+    for _ in range(8):
         x, records = mean + sd * rng.normal(size=4), []
         for t in times:
             for name, site in zip(names, sites_of(t), strict=True):
@@ -153,9 +153,9 @@ def bearings_only(rng, sites_of):
                 records.append(Record(t, name, [z], Observer(site)))
             x = np.kron(np.eye(2), F) @ x + 0.01 * np.kron(rng.normal(size=2), [32.0, 8.0])
         x = np.kron(np.eye(2), np.linalg.inv(F)) @ x  # back to the last record, but for its last disturbance
-        est = IMM(model, linearise="cubature", iterations=2).run(records)
-        e = (est.mean[-1] - x)[::2]
-        nees.append(e @ np.linalg.solve(est.cov[-1][::2, ::2], e))
+        est = IMM(model, linearise="cubature").run(records)
+        e = est.mean[-1] - x
+        nees.append(e @ np.linalg.solve(est.cov[-1], e))
         spread.append(np.sqrt(np.linalg.eigvalsh(est.cov[-1][::2, ::2])[-1]))
     return np.mean(nees), np.median(spread)
 
@@ -163,12 +163,12 @@ def bearings_only(rng, sites_of):
 def test_bearings_fix_an_object_only_from_several_places(rng):
     # Two sensors at rest, at the same times; one that passes across the line of sight; one that stays, and learns
     # next to nothing of the distance.
-    low, high = chi2.ppf([5e-4, 1 - 5e-4], 2 * 10) / 10
+    low, high = chi2.ppf([5e-4, 1 - 5e-4], 4 * 8) / 8
     two = bearings_only(rng, lambda t: ([-3e3, 0.0], [3e3, 0.0]))
     moving = bearings_only(rng, lambda t: ([-4e3 + 100.0 * t, 0.0],))
     one = bearings_only(rng, lambda t: ([0.0, 0.0],))
     assert low < two[0] < high and low < moving[0] < high
-    assert two[1] < 120.0 < moving[1] < 400.0 < 700.0 < one[1]
+    assert two[1] < 120.0 < moving[1] < 350.0 < 500.0 < one[1]
 
 
 def test_a_fault_of_the_azimuth_is_not_one_of_the_range(rng):
