@@ -138,6 +138,12 @@ def test_no_alarm_at_all_is_an_open_interval():
     assert found.delay == 0.0 and found.detected == 1.0
 
 
+def test_faults_behind_an_alarm_are_not_counted():
+    faulty = np.ones((3, 10))
+    found = calibrate(np.zeros((2, 10)), faulty, onset=5, delay=1.0)
+    assert found.threshold == 1.0 and np.isnan(found.delay) and np.isnan(found.detected)
+
+
 QUIET = np.zeros((2, 10))
 
 

@@ -132,6 +132,32 @@ def test_reference_decisions_of_the_fusion_filter(cases, name):
             np.testing.assert_array_equal(np.ravel_multi_index(mode, P.shape[1:]), case[key])
 
 
+@pytest.mark.parametrize("name", ["m222", "m222_missing", "m432_tv_missing"])
+def test_the_filter_s_own_decisions_are_those_of_the_reference(cases, name):
+    case = cases(f"fusion_{name}")
+    q1, q2, n = case["Y1"].shape[1], case["Y2"].shape[1], len(case["X0"])
+    M2, M3 = case["H1"].shape[-3], case["H2"].shape[-3]
+    lead = case["H1"].shape[:-3]
+    H, R = np.zeros((*lead, 1, M2, M3, q1 + q2, n)), np.zeros((*lead, 1, M2, M3, q1 + q2, q1 + q2))
+    H[..., :q1, :], H[..., q1:, :] = case["H1"][..., None, :, None, :, :], case["H2"][..., None, None, :, :, :]
+    R[..., :q1, :q1], R[..., q1:, q1:] = case["R1"][..., None, :, None, :, :], case["R2"][..., None, None, :, :, :]
+    est = imm_filter(
+        np.concatenate([case["Y1"], case["Y2"]], axis=-1),
+        F=case["Phi"][..., None, None, :, :],
+        Q=case["B"][..., None, None, :, :],
+        H=H,
+        R=R,
+        trans=[case["Pa"], case["Pb"], case["Pc"]],
+        mean0=case["X0"],
+        cov0=case["R0"],
+        probs0=case["P0"],
+        per_mode=True,
+    )
+    for key, beta in (("dec_alpha1_beta0", 0.0), ("dec_alpha1_beta005", 0.05)):
+        mode = est.decide(beta=beta).mode
+        np.testing.assert_array_equal(np.ravel_multi_index(mode, est.probs.shape[1:]), case[key])
+
+
 # --- Estimates.decide and joint probabilities ---------------------------------------------------------------
 
 

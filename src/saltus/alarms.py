@@ -31,7 +31,7 @@ class Calibration(NamedTuple):
     `mean_time` is the mean number of rows from a fresh start to the first false alarm, `low` and `high` the ends of
     its interval (inf where there was no alarm at all). `delay` is the mean number of rows from the fault's first row
     to the alarm (0: the same row), a missed fault counted to the end of its run; `detected` is the share of faults
-    not missed. Both are NaN without simulated faults.
+    not missed. Both are NaN without simulated faults, or where all their runs alarm before the fault.
     """
 
     threshold: float
@@ -169,7 +169,7 @@ def calibrate(
     else:
         raise ModelError("a threshold for a delay needs simulated faults: calibrate(quiet, faulty, onset=..., ...).")
     found, share = (np.nan, np.nan) if fault is None else _delay(fault, onset, threshold)
-    return Calibration(threshold, *_mean_time(clean, threshold, confidence), float(found), float(share))
+    return Calibration(threshold, *_mean_time(clean, threshold, confidence), found, share)
 
 
 def _for_mean_time(quiet: _Array, wanted: float) -> float:
@@ -206,7 +206,7 @@ def _for_delay(faulty: _Array, onset: int, wanted: float) -> float:
     low, high = 0, len(candidates)
     while low < high:
         middle = (low + high) // 2
-        if _delay(faulty, onset, float(candidates[middle]))[0] > wanted:
+        if _delay(faulty, onset, float(candidates[middle]))[0] > wanted:  # not so where it is NaN
             high = middle
         else:
             low = middle + 1
@@ -220,7 +220,7 @@ def _delay(faulty: _Array, onset: int, threshold: float) -> tuple[float, float]:
     over = faulty >= threshold
     fresh = over[~over[:, :onset].any(axis=1), onset:]
     if not len(fresh):
-        return 0.0, 1.0
+        return np.nan, np.nan
     hit = fresh.any(axis=1)
     return float(np.where(hit, fresh.argmax(axis=1), fresh.shape[1]).mean()), float(hit.mean())
 
