@@ -196,10 +196,10 @@ def _sensors(sources: Sequence[Source], recording: Recording, config: Config) ->
     for source in sources:
         sensor = config.site_for(source.system)
         sites.append(None if sensor is None else _site(sensor))
-        configured.append({} if sensor is None else _noise(sensor))
         found = [c.update_period for c in recording.contents if c.system == source.system]
         told = [p for p in found if np.isfinite(p) and p > 0]
         periods.append(float(np.median(told)) if told else _NO_PERIOD)
+        configured.append({} if sensor is None else _noise(sensor, periods[-1]))
         names.append(sensor.name if sensor is not None and sensor.name else str(source.system))
     return _Sensors(sites, configured, periods, names)
 
@@ -212,13 +212,19 @@ def _site(sensor: SensorConfig) -> Site | None:
     return Site(float(latitude), float(longitude), height, sigma)
 
 
-def _noise(sensor: SensorConfig) -> dict[str, float]:
+def _noise(sensor: SensorConfig, period: float) -> dict[str, float]:
+    """Return the fields of Noise that a configuration gives.
+
+    Of errors with the correlation a^|k| between reports k periods apart, a = exp(-period / correlation_time), the mean
+    of many has (1 + a)/(1 - a) times the variance of as many independent ones: their inflation.
+    """
     azimuth = None if sensor.sigma_azimuth is None else float(np.radians(sensor.sigma_azimuth))
     given = {
         "range": sensor.sigma_range,
         "azimuth": azimuth,
         "xy": sensor.sigma_xy,
         "altitude": sensor.sigma_altitude,
+        "inflation": sensor.correlation_time and float(1.0 / np.tanh(0.5 * period / sensor.correlation_time)),
     }
     return {field: value for field, value in given.items() if value is not None}
 

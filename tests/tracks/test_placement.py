@@ -4,9 +4,11 @@ import numpy as np
 import pyproj
 import pytest
 
+from saltus.config import SensorConfig
 from saltus.errors import DataError
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots, Source, System
+from saltus.run import _noise
 from saltus.tracks.measurements import Noise, make_plane, place_plots
 
 N = 30
@@ -96,3 +98,24 @@ def test_reports_without_observer_are_seen_from_the_source_s_site(sea):
     np.testing.assert_allclose(mixed[::2], place(always, None)[::2], atol=1e-6)
     with pytest.raises(DataError, match="unknown site"):
         place(alone, None)
+
+
+@pytest.mark.parametrize("tau", [0.3, 4.0])
+def test_errors_that_last_average_to_what_the_filter_believes(tau):
+    """The mean of many reports with errors of correlation a^|k|, against the inflation a configuration gives."""
+    sensor = SensorConfig(name="ship", sigma_xy=2.0, correlation_time=tau)
+    given = _noise(sensor, period=0.5)
+    n, a = 500, np.exp(-0.5 / tau)
+    k = np.arange(n)
+    cov = 4.0 * a ** np.abs(k[:, None] - k)
+    assert given["xy"] ** 2 * given["inflation"] / n == pytest.approx(cov.mean(), rel=0.05)
+    assert "inflation" not in _noise(SensorConfig(name="ship", sigma_xy=2.0), period=0.5)
+
+
+def test_inflation_is_the_source_s(sea):
+    ship, (x, y, _), _ = sea
+    m = place_plots(
+        reports(ship, Kind.PLANE, x=x, y=y), Plane(1.1, 0.18), [None], {0: Noise(inflation=7.0)}, (0.0, 30.0)
+    )
+    np.testing.assert_array_equal(m.inflation, 7.0)
+    np.testing.assert_allclose(m.cov[:, 0, 0], Noise().xy ** 2, rtol=1e-2)

@@ -1,5 +1,7 @@
 """Bearings on tracks: against the extended Kalman filter written out, and in scenes with cameras."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -97,12 +99,33 @@ def test_one_update_is_the_extended_kalman_filter_s(angle, rng):
     expected, expected_cov = x + K[:, 0] * nu, P - K @ H @ P
     m = bearings([dt], [origin], [z + PLANE.factors([origin])[0][0]])
     seen = sight(kinematics, life, m, np.array([0]), GATE)
-    log_f = seen.copies.update(seen.copy, seen.plan) + seen.log_scale
+    seen.copies.update(seen.copy, seen.plan)
     moments = seen.copies.moments(seen.copy)
     np.testing.assert_allclose(moments.mean[0, :4], expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(moments.cov[0, :4, :4], expected_cov, rtol=1e-4, atol=1e-5)
     # Density of the bearing, per radian.
-    assert log_f[0] == pytest.approx(-0.5 * (nu**2 / S + np.log(2 * np.pi * S)), abs=1e-4)
+    assert seen.log_f[0] == pytest.approx(-0.5 * (nu**2 / S + np.log(2 * np.pi * S)), abs=1e-4)
+
+
+def test_inflation_widens_the_update_and_no_gate():
+    """With the variance of a bearing times 9 the update is that of a sensor three times as coarse."""
+    origin, mean = [[0.0, 0.0]], np.array([200.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    cov = np.diag([9.0, 0.01, 9.0, 0.01, 1.0, 1.0])
+    m = bearings([1e-3], origin, [np.pi / 2 + 0.05])
+
+    def after(seen_by):
+        seen = sight(*one_track(mean, cov), seen_by, np.array([0]), GATE)
+        seen.copies.update(seen.copy, seen.plan)
+        return seen, seen.copies.moments(seen.copy)
+
+    inflated, moments = after(replace(m, inflation=np.array([9.0])))
+    _, coarse = after(replace(m, sigma_bearing=np.array([3.0 * SIGMA])))
+    np.testing.assert_allclose(moments.mean, coarse.mean, atol=1e-6)
+    np.testing.assert_allclose(moments.cov, coarse.cov, atol=1e-6)
+    assert inflated.log_f[0] == after(m)[0].log_f[0]
+    far = bearings([1e-3], origin, [np.pi / 2 + 0.12])
+    assert len(after(replace(far, inflation=np.array([9.0])))[0].copy) == 0
+    assert len(after(replace(far, sigma_bearing=np.array([3.0 * SIGMA])))[0].copy) == 1
 
 
 def test_gates_of_bearings():

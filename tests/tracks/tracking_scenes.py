@@ -50,6 +50,7 @@ def measured(time, xy, sigma, *, altitude=None, sigma_altitude=10.0, source=0, i
         origin=np.full((n, 2), np.nan),
         bearing=np.full(n, np.nan),
         sigma_bearing=np.full(n, np.nan),
+        inflation=np.ones(n),
     )
 
 

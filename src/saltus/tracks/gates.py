@@ -81,7 +81,7 @@ class Gate:
         z[~height_used, 2] = np.nan
         return Gated(
             Pairs(near.track[inside], near.plot[inside]),
-            Plan(z[inside], R[inside], offset[inside]),
+            Plan(z[inside], R[inside] * m.inflation[index[near.plot[inside]], None, None], offset[inside]),
             y[inside, :2],
             S[inside, :2, :2],
             d2[inside],

@@ -36,13 +36,18 @@ _SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations of one source's measurements: m and rad."""
+    """Standard deviations of one source's measurements: m and rad, each report's error by itself.
+
+    `inflation` multiplies their squares where a report updates a filter: errors that last from report to report tell
+    less than as many independent ones. Gates do without it.
+    """
 
     range: float = _RANGE
     azimuth: float = float(_AZIMUTH)
     elevation: float = float(_ELEVATION)
     xy: float = _XY
     altitude: float = _ALTITUDE
+    inflation: float = 1.0
 
 
 def default_noise(source: Source) -> Noise:
@@ -75,6 +80,7 @@ class Measurements:
     origin: _Array  # (N, 2): plane x, y of the observer of a bearing, m; NaN where there is a position instead
     bearing: _Array  # (N,): rad from the plane's y axis, clockwise; NaN likewise
     sigma_bearing: _Array  # (N,): rad; NaN likewise
+    inflation: _Array  # (N,): of the variance, where a measurement updates a filter
 
     def __len__(self) -> int:
         """Number of measurements."""
@@ -209,6 +215,7 @@ def place_plots(
         origin=sights[:, :2],
         bearing=sights[:, 2],
         sigma_bearing=sights[:, 3],
+        inflation=np.array([noise[s].inflation for s in range(len(plots.sources))])[plots.source[usable]],
     )
 
 

@@ -26,7 +26,7 @@ class Sighted(NamedTuple):
     plan: Plan  # a point on the line of sight, loose along it
     centre: _Array  # (P, 2), predicted position, m
     cov: _Array  # (P, 2, 2), of the predicted position, m^2
-    log_scale: _Array  # (P,): log of density per rad over density of the plan's point per m^2
+    log_f: _Array  # (P,): log density of the bearing, per rad
     copies: Kinematics
     copy: _Index  # (P,): row of each pair among the copies
 
@@ -40,8 +40,7 @@ def sight(kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Inde
         0 = c'(x - o) + rho v,   innovation -c'(y - o),  variance c'P c + (rho sigma)^2.
 
     It is exact in the angle (no wrapping is met), and reaches the filter as the foot of y on the line of sight with
-    covariance (rho sigma)^2 c c' + L u u', L a million times the track's own variance. Its density per m^2 becomes
-    one per rad by the factor rho sqrt(2 pi L).
+    covariance f (rho sigma)^2 c c' + L u u', f the source's inflation and L a million times the track's own variance.
 
     Args:
         kinematics: the filters of all tracks.
@@ -66,19 +65,23 @@ def sight(kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Inde
     S = np.einsum("ki,kij,kj->k", c, P, c) + sigma**2
     inside = np.flatnonzero((rho > 0.0) & (aside**2 <= gate * S))
     u, c, rho, sigma, offset = u[inside], c[inside], rho[inside], sigma[inside], offset[inside]
-    loose = _LOOSE * (np.trace(P[inside], axis1=1, axis2=2) + sigma**2)
+    mixture = copies.moments(inside)
+    P = mixture.cov[:, :3:2, :3:2]
+    S = np.einsum("ki,kij,kj->k", c, P, c) + sigma**2
+    d2 = _along(mixture.mean, offset, m.origin[plot[inside]], c) ** 2 / S
+    loose = _LOOSE * (np.trace(P, axis1=1, axis2=2) + sigma**2)
+    sigma = sigma * np.sqrt(m.inflation[plot[inside]])
     z, R = np.full((len(inside), 3), np.nan), np.zeros((len(inside), 3, 3))
     z[:, :2] = m.origin[plot[inside]] + rho[:, None] * u
     R[:, :2, :2] = sigma[:, None, None] ** 2 * _outer(c) + loose[:, None, None] * _outer(u)
     R[:, 2, 2] = 1.0
-    mixture = copies.moments(inside)
     centre = mixture.mean[:, :3:2] + offset[:, None] * mixture.mean[:, 1:4:2]
     return Sighted(
         Pairs(near.track[inside], near.plot[inside]),
         Plan(z, R, offset),
         centre,
-        mixture.cov[:, :3:2, :3:2],
-        np.log(rho) + 0.5 * np.log(2.0 * np.pi * loose),
+        P,
+        np.log(rho) - 0.5 * (d2 + np.log(2.0 * np.pi * S)),
         copies,
         inside,
     )

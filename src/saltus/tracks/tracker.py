@@ -186,9 +186,9 @@ class Tracker:
         """Absorb the bearings of one source in one slice: they update confirmed tracks, and do nothing else."""
         settings, m, life = self._settings, self._m, self._life
         seen = sight(self._kinematics, life, m, index, self._gate.height)
-        log_f = seen.copies.update(seen.copy, seen.plan) + seen.log_scale
+        seen.copies.update(seen.copy, seen.plan)
         detection = settings.detection_probability
-        gain = log_f - np.log(settings.clutter_density_azimuth) + np.log(detection / (1.0 - detection))
+        gain = seen.log_f - np.log(settings.clutter_density_azimuth) + np.log(detection / (1.0 - detection))
         chosen = assign(seen.pairs, gain)
         rows, plots = seen.pairs.track[chosen], index[seen.pairs.plot[chosen]]
         self._kinematics.put(rows, seen.copies, seen.copy[chosen])
