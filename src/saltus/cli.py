@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from typing import Literal
 
 import click
 
@@ -114,3 +115,52 @@ def demo(output: Path, seed: int) -> None:
     from saltus.demo import run_demo
 
     run_demo(output, seed)
+
+
+@main.group()
+def diagnose() -> None:
+    """Say what a sensor's errors are like, from data."""
+
+
+@diagnose.command()
+@click.argument("inputs", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--output", required=True, type=_FILE, help="Output directory.")
+@click.option("--reference", multiple=True, type=_FILE, help="Recording of better positions of the same aircraft.")
+@click.option("--config", type=_FILE, help="TOML file: date, [[sensor]] sites, editions.")
+@click.option("--date", help="Date of the recordings, YYYY-MM-DD.")
+@click.option("--columns", help="Of a table with a column time: the residuals, as east,north.")
+@click.option("--series", help="Column of the table that tells objects or passes apart.")
+@click.option(
+    "--phase",
+    type=click.Choice(["all", "air", "ground"]),
+    default="all",
+    show_default=True,
+    help="Of recordings: reports in the air or on the ground only.",
+)
+@click.option("--motion", is_flag=True, help="The columns are positions: tell noise from motion by the innovations.")
+def noise(
+    inputs: tuple[Path, ...],
+    output: Path,
+    reference: tuple[Path, ...],
+    config: Path | None,
+    date: str | None,
+    columns: str | None,
+    series: str | None,
+    phase: Literal["all", "air", "ground"],
+    motion: bool,
+) -> None:
+    """Estimate correlation time and level of errors: noise.json, noise.png and a suggested noise model in OUTPUT."""
+    from saltus.diagnose.command import diagnose_noise
+
+    names = [name.strip() for name in columns.split(",")] if columns else []
+    diagnose_noise(
+        inputs,
+        output,
+        reference=reference,
+        config_path=config,
+        date=date,
+        columns=names,
+        series=series,
+        motion=motion,
+        phase=phase,
+    )

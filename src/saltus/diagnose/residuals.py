@@ -1,0 +1,141 @@
+"""Where residuals come from: a table, or two recordings of the same aircraft."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from jaxtyping import Float
+
+from saltus import io
+from saltus.config import Config
+from saltus.errors import DataError
+from saltus.geo import Site
+from saltus.records import Kind, Plots
+from saltus.tracks.measurements import default_noise, make_plane, place_plots
+
+__all__ = ["Phase", "Residuals", "from_recordings", "from_table"]
+
+Phase = Literal["all", "air", "ground"]
+_Array = npt.NDArray[np.float64]
+
+_BRACKET = 3.0  # s: reference reports further apart are not interpolated between
+_HEIGHT = (5000.0, 3500.0)  # m: of targets that do not tell it
+
+
+class Residuals(NamedTuple):
+    """Errors (or positions) of the components of one sensor."""
+
+    names: tuple[str, ...]
+    times: Float[np.ndarray, " n"]  # s
+    values: Float[np.ndarray, "n m"]  # NaN where absent
+    labels: npt.NDArray[np.int64]  # (N,): which object or pass
+    unit: str
+
+
+def from_table(path: Path, columns: Sequence[str], series: str | None) -> Residuals:
+    """Read residuals from a CSV or Parquet table with a column `time` (seconds, or anything ISO 8601).
+
+    Raises:
+        DataError: a column is missing or holds no numbers; the message lists what there is.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    import pyarrow.csv as csv
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.read_table(path) if path.suffix.lower() in (".parquet", ".pq") else csv.read_csv(path)
+    except pa.ArrowInvalid as error:
+        raise DataError(f"{path}: is no table: {error}") from None
+    wanted = ["time", *columns] + ([series] if series is not None else [])
+    missing = [name for name in wanted if name not in table.column_names]
+    if missing:
+        raise DataError(f"{path}: no column {missing[0]!r}; there are {', '.join(table.column_names)}.")
+    time = table["time"]
+    if pa.types.is_timestamp(time.type):
+        time = pc.divide(pc.cast(pc.cast(time, pa.timestamp("us")), pa.int64()).cast(pa.float64()), 1e6)
+    numbers = []
+    for name, column in [("time", time), *((name, table[name]) for name in columns)]:
+        if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
+            raise DataError(f"{path}: column {name!r} holds {column.type}, not numbers.")
+        numbers.append(np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), np.float64))
+    labels = np.zeros(table.num_rows, np.int64)
+    if series is not None:
+        labels = np.asarray(table[series].combine_chunks().dictionary_encode().indices.fill_null(-1)).astype(np.int64)
+    return _distinct(Residuals(tuple(columns), numbers[0], np.stack(numbers[1:], axis=-1), labels, ""))
+
+
+def from_recordings(
+    inputs: Sequence[Path], reference: Sequence[Path], config: Config, phase: Phase = "all"
+) -> Residuals:
+    """Subtract the reference's position, interpolated at the time of each report of the same Mode S address.
+
+    Both are placed in one plane; the residuals are east and north in m. Reference reports more than 3 s apart are not
+    interpolated between. `phase` keeps the reports said to be in the air, or on the ground.
+
+    Raises:
+        DataError: a file cannot be read, a site is not configured, or no address occurs in both.
+    """
+    seen, truth = (
+        io.read(list(paths), date=config.date, editions=config.editions).plots for paths in (inputs, reference)
+    )
+    if phase != "all":
+        seen = seen.take(seen.on_ground == (1 if phase == "ground" else 0))
+    both = Plots.concat([seen, truth])
+    sites = [_site(both, s, config) for s in range(len(both.sources))]
+    noise = {s: default_noise(source) for s, source in enumerate(both.sources)}
+    plane = make_plane(both, sites)
+    a, b = (place_plots(p, plane, _own(p, both, sites), noise, _HEIGHT) for p in (seen, truth))
+    times, values, labels = [], [], []
+    for address in np.intersect1d(a.icao24[a.icao24 >= 0], b.icao24[b.icao24 >= 0]):
+        mine, theirs = np.flatnonzero(a.icao24 == address), np.flatnonzero(b.icao24 == address)
+        expected = _interpolated(a.time[mine], b.time[theirs], b.position[theirs, :2])
+        good = np.isfinite(expected).all(-1) & np.isfinite(a.position[mine, :2]).all(-1)
+        times.append(a.time[mine][good])
+        values.append((a.position[mine, :2] - expected)[good])
+        labels.append(np.full(int(good.sum()), address, np.int64))
+    if not times or not sum(map(len, times)):
+        raise DataError("no Mode S address is in both the recording and the reference at the same time.")
+    found = Residuals(("east", "north"), np.concatenate(times), np.concatenate(values), np.concatenate(labels), "m")
+    return _distinct(found)
+
+
+def _site(plots: Plots, s: int, config: Config) -> Site | None:
+    source = plots.sources[s]
+    sensor = config.site_for(source.system)
+    if sensor is not None and sensor.latitude is not None and sensor.longitude is not None:
+        latitude, longitude = np.radians([sensor.latitude, sensor.longitude])
+        return Site(float(latitude), float(longitude), 0.0 if sensor.height is None else sensor.height, 0.0)
+    at = (plots.source == s) & (plots.reason == 0)
+    if np.isin(plots.kind[at], (Kind.POLAR, Kind.PLANE, Kind.BEARING)).any():
+        raise DataError(f"{source.system}: its site is not configured; give a [[sensor]] table with --config.")
+    return None
+
+
+def _own(plots: Plots, both: Plots, sites: Sequence[Site | None]) -> list[Site | None]:
+    """The sites of the sources of one of the two recordings."""
+    place = {source.system: site for source, site in zip(both.sources, sites, strict=True)}
+    return [place[source.system] for source in plots.sources]
+
+
+def _interpolated(t: _Array, known: _Array, xy: _Array) -> _Array:
+    """Positions at times t, (N, 2); NaN where the two reports around t are too far apart."""
+    after = np.clip(np.searchsorted(known, t), 1, max(len(known) - 1, 1))
+    if len(known) < 2:
+        return np.full((len(t), 2), np.nan)
+    before = after - 1
+    gap = known[after] - known[before]
+    inside = (gap > 0) & (gap <= _BRACKET) & (t >= known[before]) & (t <= known[after])
+    share = np.where(inside, (t - known[before]) / np.where(gap > 0, gap, 1.0), np.nan)
+    return np.asarray(xy[before] + share[:, None] * (xy[after] - xy[before]))
+
+
+def _distinct(r: Residuals) -> Residuals:
+    """In time order, without repeated times of one object."""
+    order = np.lexsort((r.times, r.labels))
+    t, label = r.times[order], r.labels[order]
+    fresh = np.concatenate([[True], (np.diff(label) != 0) | (np.diff(t) > 0)]) & np.isfinite(t)
+    kept = order[fresh]
+    return r._replace(times=r.times[kept], values=r.values[kept], labels=r.labels[kept])
