@@ -31,6 +31,9 @@ _Array = npt.NDArray[np.float64]
 # Where nothing is configured and nothing could be estimated: a monopulse secondary radar, an airport
 # multilateration, ADS-B with good satellite navigation, heights in steps of 100 ft.
 _RANGE, _AZIMUTH, _ELEVATION, _XY, _ALTITUDE = 50.0, np.radians(0.08), np.radians(0.3), 20.0, 10.0
+_FAULTY_SHARE = 0.03  # of the range: faults scale with what a radar covers
+_SURFACE, _GROUND_RELIEF = 10, 20.0  # ASTERIX category of surface movement; m
+_SMALLEST_AREA = 1e6  # m^2
 _SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
 
 
@@ -90,6 +93,15 @@ class Measurements:
         """Return the measurements selected."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
+    def density(self, source: int, period: float) -> float:
+        """Return the reports of a source per m^2 and scan, over the circle of two deviations of its longer axis."""
+        own = np.flatnonzero((self.source == source) & np.isfinite(self.position[:, 0]))
+        if len(own) < 2:
+            return 1.0 / _SMALLEST_AREA
+        scans = max(1.0, float(np.ptp(self.time[own])) / period)
+        variance = float(np.linalg.eigvalsh(np.cov(self.position[own, :2].T))[-1])
+        return len(own) / scans / max(4.0 * np.pi * variance, _SMALLEST_AREA)
+
     def with_height(self, index: npt.NDArray[np.intp], prior: tuple[float, float]) -> tuple[_Array, _Array]:
         """Return positions (k, 3) and covariances, heights unknown replaced by their prior (mean, sd)."""
         position, cov = self.position[index].copy(), self.cov[index].copy()
@@ -100,15 +112,16 @@ class Measurements:
     def faulty(self, index: npt.NDArray[np.intp], sigma_azimuth: float, sigma_range: float, sigma_xy: float) -> _Array:
         """Return covariances (k, 2, 3, 3) of plots with a faulty azimuth, and with a faulty range.
 
-        R + sigma_azimuth^2 c c' and R + sigma_range^2 u u', u the unit vector from the site and c the vector of
-        the same length as the ground range across it. Where the source is not polar, its position is faulty:
-        R + sigma_xy^2 I, twice.
+        R + sigma_azimuth^2 c c' and R + sigma_range^2 u u', u the unit vector from the site and c the vector of the
+        same length as the ground range across it; sigma_range is cut to 3 % of the range. Where the source is not
+        polar, its position is faulty: R + sigma_xy^2 I, twice.
         """
         ray = self.ray[index]
         polar = np.isfinite(ray[:, 0])
         away = np.where(polar[:, None], ray, (1.0, 0.0))
         across = np.stack([-away[:, 1], away[:, 0]], axis=-1) * sigma_azimuth
-        along = away / np.linalg.norm(away, axis=-1, keepdims=True) * sigma_range
+        distance = np.linalg.norm(away, axis=-1, keepdims=True)
+        along = away / distance * np.minimum(sigma_range, _FAULTY_SHARE * distance)
         shift = np.stack([across, along], axis=1)
         spread = shift[..., :, None] * shift[..., None, :]
         cov = np.repeat(self.cov[index][:, None], 2, axis=1)
@@ -178,7 +191,7 @@ def place_plots(
         sites: site per source, of the reports that tell no observer; those of a source without a needed site must
             carry a reason already.
         noise: per source index.
-        height_prior: mean and standard deviation of unknown heights, m.
+        height_prior: mean and standard deviation of unknown heights, m; on an airport's surface, the ground.
     """
     usable = np.flatnonzero(plots.reason == 0)
     n = len(usable)
@@ -195,7 +208,8 @@ def place_plots(
         if kind == Kind.BEARING:
             sights[at] = _sights(own, plane, sites[s], noise[s])
         else:
-            placed = _place(own, kind, plane, sites[s], noise[s], height_prior)
+            prior = _height_prior(plots.sources[s], sites[s], height_prior)
+            placed = _place(own, kind, plane, sites[s], noise[s], prior)
             _fill(position, cov, lever, at, placed)
             site = _site(own, sites[s])
             if kind == Kind.POLAR and site is not None:
@@ -224,6 +238,13 @@ def _site(plots: Plots, site: Site | None) -> Site | Sites | None:
     if len(plots) and np.isfinite(plots.observer_latitude[0]):
         return Sites(plots.observer_latitude, plots.observer_longitude, plots.observer_height)
     return site
+
+
+def _height_prior(source: Source, site: Site | None, height_prior: tuple[float, float]) -> tuple[float, float]:
+    """Heights that reports do not tell: what a surface movement sensor (CAT010) sees stands on the ground."""
+    if source.system.category == _SURFACE and site is not None:
+        return site.height, _GROUND_RELIEF
+    return height_prior
 
 
 def _place(

@@ -58,7 +58,7 @@ class TrackerSettings:
         gate_probability: probability that a target's own plot falls inside its gate.
         detection_probability: probability that a target gives a plot in a scan.
         clutter_density: false plots and new targets per m^2 and scan; a higher value makes the tracker prefer
-            leaving a distant plot alone to stretching a track.
+            leaving a distant plot alone to stretching a track. Absent: a tenth of the density of the source's plots.
         clutter_density_azimuth: false bearings and other objects per radian and scan, of sources that give bearings
             alone.
         max_speed: fastest target, m/s: no track starts faster, and one that becomes so is dropped.
@@ -75,16 +75,17 @@ class TrackerSettings:
             sensor; a plot outside the gate of a confirmed track, or of one of its own address, may still be taken
             for such a fault, with the deviations below.
         outlier_azimuth: standard deviation of a faulty azimuth, degrees.
-        outlier_range: standard deviation of a faulty range, m.
+        outlier_range: standard deviation of a faulty range, m, but no more than 3 % of the range.
         outlier_xy: standard deviation of a faulty position, each axis, m.
-        height_prior: mean and standard deviation of the height of targets that do not tell it, m.
+        height_prior: mean and standard deviation of the height of targets that do not tell it, m; what a surface
+            movement sensor (CAT010) sees is taken to stand on the ground.
         sigma_pressure: error of pressure altitude as geometric height, m; widens the published covariance near
             the radar, where height bends slant range.
     """
 
     gate_probability: float = 0.9999
     detection_probability: float = 0.95
-    clutter_density: float = 1e-11
+    clutter_density: float | None = None
     clutter_density_azimuth: float = 1.0
     max_speed: float = 400.0
     confirm_hits: int = 3
@@ -112,7 +113,9 @@ class TrackerSettings:
                 f"tracker.confirm_hits of confirm_scans (M of N) needs 1 <= M <= N <= 32, "
                 f"got {self.confirm_hits} of {self.confirm_scans}."
             )
-        positive = ("clutter_density", "clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds")
+        if self.clutter_density is not None and not self.clutter_density > 0:
+            raise ModelError(f"tracker.clutter_density must be positive, got {self.clutter_density}.")
+        positive = ("clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds")
         for name in (*positive, "split_range", "split_azimuth"):
             if not getattr(self, name) > 0:
                 raise ModelError(f"tracker.{name} must be positive, got {getattr(self, name)}.")

@@ -24,6 +24,7 @@ _Index = npt.NDArray[np.intp]
 # keeps its period, other systems report more often now and then.
 _SLICE_ROTATING, _SLICE_OTHER = 0.9, 0.4
 _LONGEST_SLICE = 4.0  # s
+_UNEXPLAINED = 0.1  # of a source's plots are clutter or new targets
 _HEIGHT_SPAN = 15_000.0  # m: heights of clutter and new targets spread over this
 _CLIMB = 15.0  # m/s: standard deviation of the vertical speed of a new track
 _STANDING = np.array([-4.0, -2.0, 0.0])  # nats: a plot is less likely a seed's or a tentative track's own
@@ -125,6 +126,7 @@ class Tracker:
         self._track_id = np.zeros(len(measurements), np.int64)
         self._split = np.zeros(len(measurements), bool)
         self._elsewhere = np.zeros(len(measurements), bool)
+        self._density = self._densities(measurements)
         for begin, end in self._slices():
             self._housekeep(float(measurements.time[begin]))
             sources = measurements.source[begin:end]
@@ -135,6 +137,12 @@ class Tracker:
                 progress(end / len(measurements))
         confirmed = np.concatenate([np.zeros(0, np.int64), *self._confirmed])
         return Assignments(self._track_id, self._split, self._elsewhere, np.unique(confirmed))
+
+    def _densities(self, m: Measurements) -> _Array:
+        """Clutter and new targets per m^2 and scan, of each source."""
+        if self._settings.clutter_density is not None:
+            return np.full(len(self._periods), self._settings.clutter_density)
+        return _UNEXPLAINED * np.array([m.density(s, float(p)) for s, p in enumerate(self._periods)])
 
     def _slices(self) -> Iterator[tuple[int, int]]:
         time = self._m.time
@@ -201,7 +209,7 @@ class Tracker:
         settings, m, life = self._settings, self._m, self._life
         track, plot = gated.pairs.track, index[gated.pairs.plot]
         detection = settings.detection_probability
-        gain = log_f - np.log(settings.clutter_density) + np.log(detection / (1.0 - detection))
+        gain = log_f - np.log(self._density[m.source[plot]]) + np.log(detection / (1.0 - detection))
         has_height = np.isfinite(m.position[plot, 2])
         gain = gain + np.where(gated.height_used, np.log((1.0 - settings.altitude_outlier) * _HEIGHT_SPAN), 0.0)
         gain = gain + np.where(has_height & ~gated.height_used, np.log(settings.altitude_outlier), 0.0)
