@@ -50,7 +50,7 @@ class Gate:
         self.fault = _chi2_quantile(_FAULT_GATE, 2)
         self._outlier_azimuth = float(np.radians(settings.outlier_azimuth))
         self._outlier_range, self._outlier_xy = settings.outlier_range, settings.outlier_xy
-        self._accel = max(filters.accel_h)
+        self._accel, self._accel_time = max(filters.accel_h), filters.accel_time
         self._use_identity = use_identity
 
     def __call__(self, kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Index) -> Gated:
@@ -133,7 +133,8 @@ class Gate:
         """Radius of the gate after dt, from the last state and the hardest manoeuvre since."""
         cov = life.cov[rows]
         variance = cov[:, 0, 0] + cov[:, 2, 2] + dt**2 * (cov[:, 1, 1] + cov[:, 3, 3])
-        variance += 2.0 * dt * np.abs(cov[:, 0, 1] + cov[:, 2, 3]) + 0.5 * (self._accel * dt**2) ** 2
+        variance += 2.0 * dt * np.abs(cov[:, 0, 1] + cov[:, 2, 3])
+        variance += self._accel**2 * dt**3 * (0.5 * dt + 2.0 / 3.0 * self._accel_time)
         return np.asarray(np.sqrt(self.horizontal * (variance + plot_variance)))
 
     def _spread(self, m: Measurements, plot: _Index) -> _Array:

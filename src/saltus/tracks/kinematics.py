@@ -1,7 +1,7 @@
 """The filters of all tracks as rows: horizontal and vertical side by side, or jointly in three dimensions."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -160,13 +160,17 @@ class Kinematics:
 
 def make_kinematics(settings: FilterSettings) -> Kinematics:
     """Build the empty filters that the settings describe."""
-    h = _chain("horizontal", settings.accel_h, settings.sojourn_h)
-    v = _chain("vertical", settings.accel_v, settings.sojourn_v)
+    lasts = settings.accel_time
+    kind: Literal["scan", "white"] = "white" if lasts else "scan"
+    accel_h, accel_v = (
+        tuple(a * a * lasts if lasts else a for a in accel) for accel in (settings.accel_h, settings.accel_v)
+    )
+    h, v = _chain("horizontal", accel_h, settings.sojourn_h), _chain("vertical", accel_v, settings.sojourn_v)
     if settings.form == "joint":
-        motion = constant_velocity(3, accel=lambda horizontal, vertical: [horizontal, horizontal, vertical])
+        motion = constant_velocity(3, accel=lambda horizontal, vertical: [horizontal, horizontal, vertical], kind=kind)
         return Kinematics((_channel([0, 1, 2], (h, v), motion),))
-    horizontal = constant_velocity(2, accel=lambda horizontal: horizontal)
-    vertical = constant_velocity(1, accel=lambda vertical: vertical)
+    horizontal = constant_velocity(2, accel=lambda horizontal: horizontal, kind=kind)
+    vertical = constant_velocity(1, accel=lambda vertical: vertical, kind=kind)
     return Kinematics((_channel([0, 1], (h,), horizontal), _channel([2], (v,), vertical)))
 
 

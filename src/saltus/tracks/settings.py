@@ -15,7 +15,8 @@ class FilterSettings:
     """The multimode filters of every track.
 
     Modes are levels of acceleration, constant within a scan and independent between scans (sigma, m/s^2), the first
-    of them steady motion; each chain leaves a state after its mean sojourn.
+    of them steady motion; each chain leaves a state after its mean sojourn. Several sources divide the time between
+    them: give `accel_time`, or a track seen more often is taken for one that turns less.
 
     Attributes:
         form: "decomposed" runs a horizontal and a vertical filter side by side; "joint" one filter in three
@@ -25,6 +26,8 @@ class FilterSettings:
         sojourn_h: mean stay in each horizontal mode, s.
         accel_v: acceleration of each vertical mode, m/s^2.
         sojourn_v: mean stay in each vertical mode, s.
+        accel_time: s that an acceleration lasts, whatever the intervals between plots: white acceleration of density
+            accel^2 accel_time, which is alike at this interval. 0 = it lasts from plot to plot.
     """
 
     form: Literal["decomposed", "joint"] = "decomposed"
@@ -32,11 +35,14 @@ class FilterSettings:
     sojourn_h: tuple[float, ...] = (120.0, 25.0)
     accel_v: tuple[float, ...] = (0.1, 2.5)
     sojourn_v: tuple[float, ...] = (90.0, 15.0)
+    accel_time: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse settings that describe no filter."""
         if self.form not in ("decomposed", "joint"):
             raise ModelError(f'filter.form is "decomposed" or "joint", not {self.form!r}.')
+        if not 0.0 <= self.accel_time < np.inf:
+            raise ModelError(f"filter.accel_time is 0 or a time in s, got {self.accel_time}.")
         for axis in "hv":
             accel, sojourn = getattr(self, f"accel_{axis}"), getattr(self, f"sojourn_{axis}")
             if len(accel) != len(sojourn) or not accel:
