@@ -63,6 +63,8 @@ struct Kernel {
   void (*bank_read)(const Tracks&, Rows, double* log_probs, double* means, double* covs, double* workspace);
   void (*bank_write)(const Tracks&, Rows, const double* log_probs, const double* means, const double* covs);
   void (*bank_copy)(const Tracks& from, Rows source, const Tracks& to, Rows target);
+  // Does `rounds` x 16 x lanes independent fused multiply-adds: what the core can do at most.
+  double (*multiply_adds)(std::int64_t rounds);
 };
 
 // Null where this build has no such unit.

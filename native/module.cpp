@@ -383,6 +383,11 @@ NB_MODULE(_native, module) {
   module.doc() = "Compiled twins of saltus.filters.";
   module.def("instruction_sets", &instruction_sets);
   module.def("lanes", [](const std::string& isa) { return kernel_of(isa).lanes; });
+  module.def("multiply_adds", [](const std::string& isa, std::int64_t rounds) {
+    const Kernel& kernel = kernel_of(isa);
+    nb::gil_scoped_release release;
+    return kernel.multiply_adds(rounds);
+  });
   module.def("imm_filter", &imm_filter, nb::arg("isa"), nb::arg("z"), nb::arg("model"), nb::arg("out"),
              nb::arg("every"), nb::arg("threads"));
   const auto rows = nb::arg().noconvert();

@@ -10,7 +10,7 @@
 namespace saltus::SALTUS_NS {
 
 #ifndef SALTUS_UNROLL
-#define SALTUS_UNROLL 6
+#define SALTUS_UNROLL 9
 #endif
 
 // Keeps the moments of a mode of probability zero defined, and touches nothing else.
@@ -20,7 +20,7 @@ inline constexpr double kFloor = 1e-290;
 template <int N, class F>
 SALTUS_INLINE void each(int n, F f) {
   if constexpr (N > 0 && N <= SALTUS_UNROLL) {
-#pragma GCC unroll 8
+#pragma GCC unroll 9
     for (int i = 0; i < N; ++i) f(i);
   } else {
     const int end = N > 0 ? N : n;
@@ -33,7 +33,7 @@ SALTUS_INLINE void each(int n, F f) {
 template <int N, class F>
 SALTUS_INLINE void upto(int i, F f) {
   if constexpr (N > 0 && N <= SALTUS_UNROLL) {
-#pragma GCC unroll 8
+#pragma GCC unroll 9
     for (int j = 0; j < N; ++j)
       if (j <= i) f(j);
   } else {
@@ -46,7 +46,7 @@ SALTUS_INLINE void upto(int i, F f) {
 template <int N, class F>
 SALTUS_INLINE void from(int i, int n, F f) {
   if constexpr (N > 0 && N <= SALTUS_UNROLL) {
-#pragma GCC unroll 8
+#pragma GCC unroll 9
     for (int j = 0; j < N; ++j)
       if (j >= i) f(j);
   } else {

@@ -50,8 +50,22 @@ void bank_write(const Tracks& t, Rows rows, const double* log_probs, const doubl
   write_rows(t, rows, log_probs, means, covs);
 }
 
+double multiply_adds(std::int64_t rounds) {
+  V sums[16];
+  for (int i = 0; i < 16; ++i) sums[i] = splat(double(i));
+  const V factor = splat(0.999), term = splat(1e-3);
+  for (std::int64_t k = 0; k < rounds; ++k) {
+#pragma GCC unroll 16
+    for (int i = 0; i < 16; ++i) sums[i] = sums[i] * factor + term;
+  }
+  V total{};
+  for (int i = 0; i < 16; ++i) total += sums[i];
+  return total[0];
+}
+
 const Kernel kernel{SALTUS_NAME(SALTUS_NS), W,          filter_workspace, filter,    bank_workspace, block_size,
-                    bank_step,              bank_measure, bank_moments,     bank_read, bank_write,     copy_rows};
+                    bank_step,              bank_measure, bank_moments,     bank_read, bank_write,     copy_rows,
+                    multiply_adds};
 
 }  // namespace
 }  // namespace saltus::SALTUS_NS
