@@ -4,13 +4,10 @@ import json
 import re
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
-import click
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -20,11 +17,12 @@ import pyarrow.parquet as pq
 from saltus import io
 from saltus.config import Config, SensorConfig, load_config, parse_date
 from saltus.errors import DataError
-from saltus.geo import Plane, Site
+from saltus.geo import Site
 from saltus.io.write import output_directory
 from saltus.progress import Progress, progress_bar
 from saltus.records import REASONS, Kind, Plots, Recording, Source
-from saltus.tracks.measurements import Measurements, Noise, default_noise, make_plane, place_plots
+from saltus.summary import SIGMAS, Sensors, Tracked, reported_kind, show_summary, summarise
+from saltus.tracks.measurements import Measurements, default_noise, make_plane, place_plots
 from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
 from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.tracker import Assignments, Rows, Tracker, join_rows
@@ -36,33 +34,6 @@ _Array = npt.NDArray[np.float64]
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 _NOISE_PLOTS = 5_000  # reports of each source that the noise is estimated from before tracking
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
-_SIGMAS = {  # by what a source reports: label, field of Noise, unit
-    Kind.POLAR: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
-    Kind.PLANE: (("sigma_xy_m", "xy", 1.0),),
-    Kind.BEARING: (("sigma_azimuth_deg", "azimuth", 180.0 / np.pi),),
-}
-
-
-@dataclass(frozen=True, slots=True)
-class _Sensors:
-    """What is known of each source of a recording, by source index."""
-
-    sites: list[Site | None]
-    configured: list[dict[str, float]]  # fields of Noise that the configuration gives
-    periods: list[float]
-    names: list[str]
-
-
-@dataclass(frozen=True, slots=True)
-class _Tracked:
-    """Everything the tracker found."""
-
-    rows: list[Rows]
-    measurements: Measurements
-    assignments: Assignments
-    plane: Plane
-    noise: dict[int, Noise]
-    estimates: dict[int, NoiseEstimate]
 
 
 def track_files(
@@ -106,7 +77,7 @@ def track_files(
         tracks, gates = _tables(tracked, plots, config)
         assigned = assignment_table(plots, tracked.measurements, tracked.assignments)
         done = time.perf_counter()
-        summary = _summary(inputs, plots, sensors, tracked, tracks, assigned, problems)
+        summary = summarise(inputs, plots, sensors, tracked, tracks, assigned, problems)
         summary["settings"] = {
             "identity": identity,
             "tracker": asdict(config.tracker),
@@ -127,7 +98,7 @@ def track_files(
                 summary=summary,
                 sites=sites,
             )
-    _show(summary, output, report)
+    show_summary(summary, output, report)
     return summary
 
 
@@ -146,7 +117,7 @@ def parse_time(text: str, start: float) -> float:
 
 def _prepare(
     recording: Recording, config: Config, time_from: str | None, time_to: str | None
-) -> tuple[Plots, _Sensors, list[str]]:
+) -> tuple[Plots, Sensors, list[str]]:
     """Mark what cannot be used, and gather what is known of the sensors."""
     plots, problems = recording.plots, list(recording.problems)
     reason = plots.reason.copy()
@@ -189,7 +160,7 @@ def _nothing_left(plots: Plots, problems: Sequence[str]) -> str:
     return f"no report can be tracked: {listed}. " + " ".join(problems)
 
 
-def _sensors(sources: Sequence[Source], recording: Recording, config: Config) -> _Sensors:
+def _sensors(sources: Sequence[Source], recording: Recording, config: Config) -> Sensors:
     sites: list[Site | None] = []
     configured: list[dict[str, float]] = []
     periods, names = [], []
@@ -201,7 +172,7 @@ def _sensors(sources: Sequence[Source], recording: Recording, config: Config) ->
         periods.append(float(np.median(told)) if told else _NO_PERIOD)
         configured.append({} if sensor is None else _noise(sensor, periods[-1]))
         names.append(sensor.name if sensor is not None and sensor.name else str(source.system))
-    return _Sensors(sites, configured, periods, names)
+    return Sensors(sites, configured, periods, names)
 
 
 def _site(sensor: SensorConfig) -> Site | None:
@@ -229,7 +200,7 @@ def _noise(sensor: SensorConfig, period: float) -> dict[str, float]:
     return {field: value for field, value in given.items() if value is not None}
 
 
-def _track(plots: Plots, sensors: _Sensors, config: Config, use_identity: bool, bar: Progress) -> _Tracked:
+def _track(plots: Plots, sensors: Sensors, config: Config, use_identity: bool, bar: Progress) -> Tracked:
     """Estimate the noise nobody configured on a first stretch, then track everything."""
     plane = make_plane(plots, sensors.sites)
     sources = range(len(plots.sources))
@@ -253,7 +224,7 @@ def _track(plots: Plots, sensors: _Sensors, config: Config, use_identity: bool, 
         for s in sources:
             noise[s] = replace(widened(noise[s], _steady_d2(rows, m, s)), **sensors.configured[s])
     rows, m, found, estimates = run(plots, "tracking")
-    return _Tracked(rows, m, found, plane, noise, estimates)
+    return Tracked(rows, m, found, plane, noise, estimates)
 
 
 def _steady_d2(rows: Sequence[Rows], m: Measurements, s: int) -> _Array:
@@ -265,15 +236,7 @@ def _steady_d2(rows: Sequence[Rows], m: Measurements, s: int) -> _Array:
 
 def _configured(plots: Plots, s: int, given: dict[str, float]) -> bool:
     """Say whether the configuration gives every standard deviation that the source's reports need."""
-    return {field for _, field, _ in _SIGMAS[_reports(plots, s)]} <= set(given)
-
-
-def _reports(plots: Plots, s: int) -> int:
-    """What a source reports: polar where any report is, bearings where nothing else is, else plane positions."""
-    kinds = plots.kind[(plots.source == s) & (plots.kind != Kind.NONE)]
-    if (kinds == Kind.POLAR).any():
-        return Kind.POLAR
-    return Kind.BEARING if len(kinds) and (kinds == Kind.BEARING).all() else Kind.PLANE
+    return {field for _, field, _ in SIGMAS[reported_kind(plots, s)]} <= set(given)
 
 
 def _first_stretch(plots: Plots) -> Plots:
@@ -285,7 +248,7 @@ def _first_stretch(plots: Plots) -> Plots:
     return plots.take(slice(0, last + 1))
 
 
-def _tables(tracked: _Tracked, plots: Plots, config: Config) -> tuple[pa.Table, pa.Table]:
+def _tables(tracked: Tracked, plots: Plots, config: Config) -> tuple[pa.Table, pa.Table]:
     """Return the rows of tracks that were confirmed at some time, in time order, and their gates."""
     m, plane = tracked.measurements, tracked.plane
     tracks = [track_table(rows, plane, plots, m, config.tracker.sigma_pressure) for rows in _chunks(tracked.rows)]
@@ -305,90 +268,7 @@ def _chunks(rows: Sequence[Rows], size: int = 200) -> Iterator[Rows]:
         yield join_rows(rows[k : k + size])
 
 
-def _summary(
-    inputs: Sequence[Path],
-    plots: Plots,
-    sensors: _Sensors,
-    tracked: _Tracked,
-    tracks: pa.Table,
-    assigned: pa.Table,
-    problems: Sequence[str],
-) -> dict[str, object]:
-    used = int(pc.sum(pc.is_valid(assigned["track_id"])).as_py() or 0)
-    reasons = pc.value_counts(assigned["reason"].drop_null()).to_pylist()
-    status = np.array(tracks["status"])
-    ids = tracked.assignments.track_id
-    hours = float(np.ptp(tracked.measurements.time)) / 3600.0
-    return {
-        "version": version("saltus"),
-        "inputs": [Path(p).name for p in inputs],
-        "time_from": float(tracked.measurements.time[0]),
-        "time_to": float(tracked.measurements.time[-1]),
-        "reports": {"read": len(plots), "used": used, "unused": len(plots) - used},
-        "reasons": {r["values"]: r["counts"] for r in sorted(reasons, key=lambda r: -r["counts"])},
-        "tracks": {
-            "confirmed": len(tracked.assignments.confirmed),
-            "confirmed_per_hour": round(len(tracked.assignments.confirmed) / hours, 1) if hours > 0 else None,
-            "never_confirmed": len(np.setdiff1d(ids[ids > 0], tracked.assignments.confirmed)),
-            "updates": int((status != "coasted").sum()),
-            "coasted": int((status == "coasted").sum()),
-        },
-        "noise": _noise_table(plots, sensors, tracked),
-        "problems": list(problems),
-    }
-
-
-def _noise_table(plots: Plots, sensors: _Sensors, tracked: _Tracked) -> dict[str, object]:
-    """State for each source what was configured, estimated and used, and whether the innovations agree."""
-    m = tracked.measurements
-    updated = [(rows.measurement, rows.d2) for rows in tracked.rows]
-    measurement = np.concatenate([np.zeros(0, np.intp), *(u[0] for u in updated)])
-    d2 = np.concatenate([np.zeros(0), *(u[1] for u in updated)])
-    table: dict[str, object] = {}
-    for s, name in enumerate(sensors.names):
-        at = (measurement >= 0) & (m.source[measurement] == s) & np.isfinite(d2)
-        given, found, used = sensors.configured[s], tracked.estimates[s], tracked.noise[s]
-        row: dict[str, object] = {"system": str(plots.sources[s].system)}
-        for label, field, scale in _SIGMAS[_reports(plots, s)]:
-            row[label] = {
-                "configured": _rounded(given.get(field, np.nan) * scale),
-                "estimated": _rounded(getattr(found, field) * scale),
-                "used": _rounded(getattr(used, field) * scale),
-            }
-        row["update_period_s"] = _rounded(sensors.periods[s])
-        row["nis_mean"] = _rounded(float(d2[at].mean()) if at.any() else np.nan)
-        row["nis_expected"] = 2.0
-        table[name if name not in table else f"{name} ({plots.sources[s].system})"] = row
-    return table
-
-
-def _rounded(value: float) -> float | None:
-    return float(f"{value:.4g}") if np.isfinite(value) else None
-
-
 def _write(folder: Path, tracks: pa.Table, assigned: pa.Table, summary: dict[str, object]) -> None:
     pq.write_table(tracks, folder / "tracks.parquet")
     pq.write_table(assigned, folder / "assignments.parquet")
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-
-
-def _show(summary: dict[str, Any], output: Path, report: bool) -> None:
-    """Say on the screen what was done and where it lies."""
-    reports, tracks = summary["reports"], summary["tracks"]
-    click.echo(f"{reports['read']} reports read, {reports['used']} on {tracks['confirmed']} confirmed tracks")
-    for reason, count in summary["reasons"].items():
-        click.echo(f"  {count:>8} {reason}")
-    for name, row in summary["noise"].items():
-        sigmas = ", ".join(
-            f"{label} {row[label]['used']} (configured {row[label]['configured'] or 'none'}, "
-            f"estimated {row[label]['estimated'] or 'unknown'})"
-            for label in row
-            if label.startswith("sigma")
-        )
-        click.echo(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (expected 2)")
-    for problem in summary["problems"]:
-        click.echo(f"note: {problem}", err=True)
-    seconds = summary["seconds"]
-    click.echo(f"decoding {seconds['decoding']} s, tracking {seconds['tracking']} s; written to {output}/")
-    if report:
-        click.echo(f"open {output / 'report.html'}")

@@ -1,0 +1,150 @@
+"""What a run of the tracker found, in numbers: `summary.json`, and the lines on the screen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from saltus.geo import Plane, Site
+from saltus.records import Kind, Plots
+from saltus.tracks.measurements import Measurements, Noise
+from saltus.tracks.noise import NoiseEstimate
+from saltus.tracks.tracker import Assignments, Rows
+
+__all__ = ["SIGMAS", "Sensors", "Tracked", "reported_kind", "show_summary", "summarise"]
+
+SIGMAS = {  # by what a source reports: label, field of Noise, unit
+    Kind.POLAR: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
+    Kind.PLANE: (("sigma_xy_m", "xy", 1.0),),
+    Kind.BEARING: (("sigma_azimuth_deg", "azimuth", 180.0 / np.pi),),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """What is known of each source of a recording, by source index."""
+
+    sites: list[Site | None]
+    configured: list[dict[str, float]]  # fields of Noise that the configuration gives
+    periods: list[float]
+    names: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """Everything the tracker found."""
+
+    rows: list[Rows]
+    measurements: Measurements
+    assignments: Assignments
+    plane: Plane
+    noise: dict[int, Noise]
+    estimates: dict[int, NoiseEstimate]
+
+
+def reported_kind(plots: Plots, s: int) -> int:
+    """What a source reports: polar where any report is, bearings where nothing else is, else plane positions."""
+    kinds = plots.kind[(plots.source == s) & (plots.kind != Kind.NONE)]
+    if (kinds == Kind.POLAR).any():
+        return Kind.POLAR
+    return Kind.BEARING if len(kinds) and (kinds == Kind.BEARING).all() else Kind.PLANE
+
+
+def summarise(
+    inputs: Sequence[Path],
+    plots: Plots,
+    sensors: Sensors,
+    tracked: Tracked,
+    tracks: pa.Table,
+    assigned: pa.Table,
+    problems: Sequence[str],
+) -> dict[str, object]:
+    """Count reports, tracks and reasons, and state every source's noise.
+
+    Args:
+        inputs: files read.
+        plots: reports in time order.
+        sensors: what was known of the sources.
+        tracked: what the tracker found.
+        tracks: rows of tracks.parquet.
+        assigned: rows of assignments.parquet.
+        problems: lines for the user.
+    """
+    used = int(pc.sum(pc.is_valid(assigned["track_id"])).as_py() or 0)
+    reasons = pc.value_counts(assigned["reason"].drop_null()).to_pylist()
+    status = np.array(tracks["status"])
+    ids = tracked.assignments.track_id
+    hours = float(np.ptp(tracked.measurements.time)) / 3600.0
+    return {
+        "version": version("saltus"),
+        "inputs": [Path(p).name for p in inputs],
+        "time_from": float(tracked.measurements.time[0]),
+        "time_to": float(tracked.measurements.time[-1]),
+        "reports": {"read": len(plots), "used": used, "unused": len(plots) - used},
+        "reasons": {r["values"]: r["counts"] for r in sorted(reasons, key=lambda r: -r["counts"])},
+        "tracks": {
+            "confirmed": len(tracked.assignments.confirmed),
+            "confirmed_per_hour": round(len(tracked.assignments.confirmed) / hours, 1) if hours > 0 else None,
+            "never_confirmed": len(np.setdiff1d(ids[ids > 0], tracked.assignments.confirmed)),
+            "updates": int((status != "coasted").sum()),
+            "coasted": int((status == "coasted").sum()),
+        },
+        "noise": _noise_table(plots, sensors, tracked),
+        "problems": list(problems),
+    }
+
+
+def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, object]:
+    """State for each source what was configured, estimated and used, and whether the innovations agree."""
+    m = tracked.measurements
+    updated = [(rows.measurement, rows.d2) for rows in tracked.rows]
+    measurement = np.concatenate([np.zeros(0, np.intp), *(u[0] for u in updated)])
+    d2 = np.concatenate([np.zeros(0), *(u[1] for u in updated)])
+    table: dict[str, object] = {}
+    for s, name in enumerate(sensors.names):
+        at = (measurement >= 0) & (m.source[measurement] == s) & np.isfinite(d2)
+        given, found, used = sensors.configured[s], tracked.estimates[s], tracked.noise[s]
+        row: dict[str, object] = {"system": str(plots.sources[s].system)}
+        for label, field, scale in SIGMAS[reported_kind(plots, s)]:
+            row[label] = {
+                "configured": _rounded(given.get(field, np.nan) * scale),
+                "estimated": _rounded(getattr(found, field) * scale),
+                "used": _rounded(getattr(used, field) * scale),
+            }
+        row["update_period_s"] = _rounded(sensors.periods[s])
+        row["nis_mean"] = _rounded(float(d2[at].mean()) if at.any() else np.nan)
+        row["nis_expected"] = 2.0
+        table[name if name not in table else f"{name} ({plots.sources[s].system})"] = row
+    return table
+
+
+def _rounded(value: float) -> float | None:
+    return float(f"{value:.4g}") if np.isfinite(value) else None
+
+
+def show_summary(summary: dict[str, Any], output: Path, report: bool) -> None:
+    """Say on the screen what was done and where it lies."""
+    reports, tracks = summary["reports"], summary["tracks"]
+    click.echo(f"{reports['read']} reports read, {reports['used']} on {tracks['confirmed']} confirmed tracks")
+    for reason, count in summary["reasons"].items():
+        click.echo(f"  {count:>8} {reason}")
+    for name, row in summary["noise"].items():
+        sigmas = ", ".join(
+            f"{label} {row[label]['used']} (configured {row[label]['configured'] or 'none'}, "
+            f"estimated {row[label]['estimated'] or 'unknown'})"
+            for label in row
+            if label.startswith("sigma")
+        )
+        click.echo(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (expected 2)")
+    for problem in summary["problems"]:
+        click.echo(f"note: {problem}", err=True)
+    seconds = summary["seconds"]
+    click.echo(f"decoding {seconds['decoding']} s, tracking {seconds['tracking']} s; written to {output}/")
+    if report:
+        click.echo(f"open {output / 'report.html'}")
