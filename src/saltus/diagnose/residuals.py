@@ -32,6 +32,7 @@ class Residuals(NamedTuple):
     values: Float[np.ndarray, "n m"]  # NaN where absent
     labels: npt.NDArray[np.int64]  # (N,): which object or pass
     unit: str
+    reference: Float[np.ndarray, "n m"] | None = None  # positions the residuals were taken from, where known
 
 
 def from_table(path: Path, columns: Sequence[str], series: str | None) -> Residuals:
@@ -88,17 +89,25 @@ def from_recordings(
     noise = {s: default_noise(source) for s, source in enumerate(both.sources)}
     plane = make_plane(both, sites)
     a, b = (place_plots(p, plane, _own(p, both, sites), noise, _HEIGHT) for p in (seen, truth))
-    times, values, labels = [], [], []
+    times, values, labels, known = [], [], [], []
     for address in np.intersect1d(a.icao24[a.icao24 >= 0], b.icao24[b.icao24 >= 0]):
         mine, theirs = np.flatnonzero(a.icao24 == address), np.flatnonzero(b.icao24 == address)
         expected = _interpolated(a.time[mine], b.time[theirs], b.position[theirs, :2])
         good = np.isfinite(expected).all(-1) & np.isfinite(a.position[mine, :2]).all(-1)
         times.append(a.time[mine][good])
         values.append((a.position[mine, :2] - expected)[good])
+        known.append(expected[good])
         labels.append(np.full(int(good.sum()), address, np.int64))
     if not times or not sum(map(len, times)):
         raise DataError("no Mode S address is in both the recording and the reference at the same time.")
-    found = Residuals(("east", "north"), np.concatenate(times), np.concatenate(values), np.concatenate(labels), "m")
+    found = Residuals(
+        ("east", "north"),
+        np.concatenate(times),
+        np.concatenate(values),
+        np.concatenate(labels),
+        "m",
+        np.concatenate(known),
+    )
     return _distinct(found)
 
 
@@ -138,4 +147,5 @@ def _distinct(r: Residuals) -> Residuals:
     t, label = r.times[order], r.labels[order]
     fresh = np.concatenate([[True], (np.diff(label) != 0) | (np.diff(t) > 0)]) & np.isfinite(t)
     kept = order[fresh]
-    return r._replace(times=r.times[kept], values=r.values[kept], labels=r.labels[kept])
+    known = None if r.reference is None else r.reference[kept]
+    return r._replace(times=r.times[kept], values=r.values[kept], labels=r.labels[kept], reference=known)

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from saltus.errors import DataError, ModelError, NumericalError
 from saltus.filters import steps
 from saltus.filters.align import Aligned, align
+from saltus.filters.backend import Backend
 from saltus.filters.coloured_model import Augmented, Differenced, augment, difference
 from saltus.filters.estimates import Estimates
 from saltus.filters.imm import imm_filter
@@ -133,6 +134,7 @@ def run_augmented(
     *,
     R: npt.ArrayLike | None = None,
     per_mode: bool = False,
+    backend: Backend | None = None,
 ) -> Estimates:
     """Filter the augmented state from its first sample on; the estimates are those of x.
 
@@ -153,6 +155,7 @@ def run_augmented(
         cov0=first.covs,
         probs0=np.exp(first.log_probs),
         per_mode=per_mode,
+        backend=backend,
     )
     return replace(of_state(done, model.n_state), log_likelihood_start=log_start)
 
