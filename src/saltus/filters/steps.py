@@ -190,8 +190,8 @@ def condition(
 
     nu = z - y,  K = U S^-1,  x = x+ + K nu,  P = (A - K C) P (A - K C)' + [I -K] N [I -K]'
 
-    A component not seen has its row of C, U, nu zero and its row and column of S and N those of the unit matrix,
-    so it changes nothing and costs no branch.
+    A component not seen has its column of U and its nu zero and its row and column of S those of the unit matrix, so
+    it changes nothing and costs no branch.
 
     Raises:
         NumericalError: an innovation covariance is not positive definite.
@@ -208,11 +208,9 @@ def condition(
         d2, logdet, L_inv = gaussian_terms(nu, S)
     except np.linalg.LinAlgError as error:
         raise NumericalError(NOT_POSITIVE) from error
-    K = U @ L_inv.swapaxes(-1, -2) @ L_inv
+    K = U @ L_inv.swapaxes(-1, -2) @ L_inv  # columns of components not seen are zero, so C and N need no mask
     gain = np.concatenate([np.broadcast_to(np.eye(n), (*K.shape[:-1], n)), -K], axis=-1)
-    on_all = np.concatenate([np.ones((*on.shape[:-1], n)), on], axis=-1)
-    N = N * (on_all[..., :, None] * on_all[..., None, :])
-    cov = quadratic_form(A - K @ (C * on[..., None]), P) + quadratic_form(gain, N)
+    cov = quadratic_form(A - K @ C, P) + quadratic_form(gain, N)
     loglik = np.asarray(-0.5 * (d2 + logdet + _LOG_2PI * on.sum(-1)))
     return Conditioned(mean + (K @ nu[..., None])[..., 0], cov, loglik, d2)
 
