@@ -191,6 +191,14 @@ def test_sensors_are_checked_pickled_and_compared():
     assert augmented(model_with({"a": PLAIN})) == model_with({"a": PLAIN})
 
 
+def test_modes_that_differ_in_the_memory_of_noise_alone_can_be_told_apart():
+    fades = Chain("fades", {"fast": 1.0, "slow": 9.0}, sojourn={"fast": 30.0, "slow": 10.0})
+    told = ColouredSensor(POSITION, first_order(lambda fades: fades, 3.0, dims=2))
+    assert model_with({"a": told}, chains=[fades]).check() == []
+    alike = ColouredSensor(POSITION, first_order(lambda fades: 5.0, 3.0, dims=2))
+    assert [f.kind for f in model_with({"a": alike}, chains=[fades]).check()] == ["indistinguishable"]
+
+
 def test_what_coloured_noise_does_not_go_with_is_refused(rng):
     model = model_with({"a": ONE, "b": PolarSensor(sigma_range=30.0, sigma_azimuth=0.01)})
     with pytest.raises(ModelError, match="'b' is nonlinear"):

@@ -8,6 +8,7 @@ import numpy as np
 
 from saltus.models.arrays import Arrays
 from saltus.models.checks import FloatArray
+from saltus.models.coloured import ColouredSensor
 from saltus.models.dependence import TimeDependent, fixed
 from saltus.models.dynamics import LinearSDE, LinearTransition
 from saltus.models.hybrid import HybridModel
@@ -140,6 +141,9 @@ def _nonlinear(model: HybridModel, mean: FloatArray) -> Iterator[tuple[FloatArra
             now = sensor.at(0.0)
             with np.errstate(invalid="ignore", divide="ignore"):  # a range rate at the observer's place
                 yield from ((now.noise(), 2), (np.nan_to_num(now.h(mean)), 1))
+        if isinstance(sensor, ColouredSensor):  # modes may differ in the noise's memory alone
+            noise = sensor.bound_noise()
+            yield from ((fixed(noise.F, "F"), 2), (fixed(noise.G, "G"), 2))
 
 
 def _alike(model: HybridModel, arrays: Arrays) -> Iterator[Finding]:
