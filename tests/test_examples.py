@@ -97,6 +97,23 @@ def test_the_report_puts_them_where_they_were_seen(autoferry, tmp_path):
     np.testing.assert_allclose(np.stack([east, north]), [[46] * 3, [5, -95, -195]], atol=1e-3)
 
 
+def test_a_row_without_observer_is_told(autoferry, tmp_path):
+    """Where neither the row nor the configuration says from where: a reason, a count, and both ways to mend it."""
+    detections = [scan(1, k, [5, 6 + k]) for k in range(6)] + [scan(3, 6, 0.5)]
+    truth = [[{"targetID": 1, "position": [0, 0, 0], "time": START}]]
+    autoferry.main(*write(tmp_path, detections, truth), tmp_path, ("lidar", "ir"))
+    table = pq.read_table(tmp_path / "measurements.parquet")
+    ship = table["observer_x_m"].to_numpy().copy()
+    ship[[2, 6]] = np.nan
+    table = table.set_column(table.column_names.index("observer_x_m"), "observer_x_m", [ship])
+    pq.write_table(table, tmp_path / "holes.parquet")
+    summary = track_files([tmp_path / "holes.parquet"], tmp_path, EXAMPLES / "autoferry.toml", report=False)
+    assert summary["reasons"]["site unknown"] == 2
+    told = [p for p in summary["problems"] if "relative to a site" in p]
+    assert [p.partition(":")[0] for p in told] == ["ir", "lidar"]
+    assert all("[[sensor]]" in p and "observer_latitude" in p for p in told)
+
+
 def boats(time):
     """Two boats on straight courses, north and east of the origin at the times."""
     return np.array([[50.0 + 2.0 * time, -200.0 + 3.0 * time], [150.0 - 1.0 * time, 250.0 - 2.5 * time]])

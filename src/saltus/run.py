@@ -146,9 +146,10 @@ def _prepare(
 def _site_wanted(source: Source, count: int) -> str:
     system = source.system
     keys = f"sac = {system.sac}, sic = {system.sic}" if system.category is not None else f'name = "{system.name}"'
+    moving = "" if system.category is not None else " A sensor that moves tells its own place: see observer_latitude."
     return (
         f"{system}: {count} reports are relative to a site whose position is not configured. Give it in a file "
-        f"named with --config: a [[sensor]] table with {keys}, latitude, longitude (degrees), height (m)."
+        f"named with --config: a [[sensor]] table with {keys}, latitude, longitude (degrees), height (m).{moving}"
     )
 
 
