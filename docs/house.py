@@ -10,6 +10,7 @@ WORDS = {
     "run": "recordings to tracks",
     "info": "what is in a recording",
     "score": "tracks against the truth",
+    "diagnose": "what noise a recording has",
     "summary": "a run in numbers",
     "report": "one page of HTML",
     "config": "the TOML configuration",
