@@ -127,6 +127,15 @@ def test_autocovariance_of_a_wave_is_a_wave():
     np.testing.assert_allclose(cov, np.cos(2 * np.pi * lags / 20), atol=0.03)
 
 
+def test_what_the_data_do_not_bound_is_left_open(rng):
+    t, r, _ = draw(rng, 15.0, 3.0, 1.0, n=300, n_series=1)
+    dt = np.diff(t, prepend=t[0])
+    v = np.cumsum(np.sqrt(0.05 * dt) * rng.normal(size=len(t)))
+    fit = fit_noise(t, r + np.cumsum(v * dt), motion=True)  # slow noise is much like slow motion
+    assert fit.tau.low is None and fit.tau.high is None and fit.white.low is not None
+    assert ("do not bound" in fit.suggestion()) == (fit.tau.low is None)
+
+
 @pytest.mark.parametrize(
     ("times", "values", "message"),
     [

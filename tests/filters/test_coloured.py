@@ -196,6 +196,20 @@ def test_without_chains_it_is_the_dense_gaussian_answer(rng, n, m):
     assert np.abs(got - total).max() < 1e-8 * (1 + np.abs(total).max())
 
 
+def test_a_white_part_goes_through_augmentation(rng):
+    p = random_coloured(rng, (), 3, 2, 6)
+    a = augmented_problem(p)
+    T, R = len(p["z"]), random_cov(rng, (), 2)
+    H = np.broadcast_to(a["H"], (T, 2, 5))
+    args = (a["F"], a["Q"], H, np.broadcast_to(R, (T, 2, 2)), np.zeros((T, 5)), np.zeros((T, 2)), a["mean0"], a["cov0"])
+    mean, cov, total = dense_kalman(p["z"], *args)
+    est = augmented_filter(**p, R=R)
+    assert error(est.mean, mean[1:, :3]) < 1e-8 and error(est.cov, cov[1:, :3, :3]) < 1e-8
+    assert est.log_likelihood_start + est.log_likelihood.sum() == pytest.approx(total[-1], rel=1e-9)
+    with pytest.raises(ModelError, match="must not vary in time"):
+        augmented_filter(**p, R=np.broadcast_to(R, (6, 2, 2)))
+
+
 def test_batch_rows_are_what_each_run_gives_alone(rng):
     p = random_coloured(rng, (2, 3), 3, 2, 8, batch=(2, 3), missing=0.3)
     p["z"][0, 0] = np.where(np.isnan(p["z"][0, 0]), 0.3, p["z"][0, 0])  # one run is complete, the others are not

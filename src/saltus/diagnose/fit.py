@@ -17,6 +17,7 @@ _Array = npt.NDArray[np.float64]
 _SIGNIFICANT = 9.21  # twice the log-likelihood ratio: chi-square, 2 degrees of freedom, 1 %
 _WORTH = 3.84  # likewise for one parameter, 5 %
 _UNEXPLAINED = 0.25  # correlation of successive innovations that a right model does not leave
+_LOST = 1e-3  # share of a parameter along directions without information that leaves it open
 _FINE = 0.02  # last step of the search, in logarithms
 _HIDDEN = 9.0  # logit of the coloured share at which the white part counts as absent
 
@@ -69,7 +70,8 @@ class NoiseFit(NamedTuple):
         if self.verdict == "white":
             return f"R = {self.sigma.value**2 + self.white.value**2:.4g}  # white is enough"
         white = f", white={self.white.value**2:.4g}" if self.white.value > 0 else ""
-        return f"first_order(tau={self.tau.value:.4g}, sigma={self.sigma.value:.4g}{white})"
+        known = "" if self.tau.low is not None else "  # these data do not bound it"
+        return f"first_order(tau={self.tau.value:.4g}, sigma={self.sigma.value:.4g}{white}){known}"
 
 
 def fit_noise(
@@ -222,12 +224,13 @@ def _intervals(data: Series, theta: _Array, absent: bool) -> list[Parameter]:
         information[i, j] = -(corners[1, 1] - corners[1, -1] - corners[-1, 1] + corners[-1, -1]) / (4 * h * h)
     out = [Parameter(float(v), None, None) for v in theta]
     values, vectors = np.linalg.eigh(0.5 * (information + information.T))
-    if values[0] > 0:
-        sd = np.sqrt(((vectors**2) / values).sum(axis=1))
-        for i, s in zip(free, sd, strict=True):
-            if s < 3.0:
-                spread = float(np.exp(1.96 * s))
-                out[i] = Parameter(float(theta[i]), float(theta[i] / spread), float(theta[i] * spread))
+    flat = values <= 0  # directions in which the data say nothing
+    sd = np.sqrt(((vectors[:, ~flat] ** 2) / values[~flat]).sum(axis=1))
+    lost = (vectors[:, flat] ** 2).sum(axis=1) > _LOST
+    for i, s, unknown in zip(free, sd, lost, strict=True):
+        if s < 3.0 and not unknown:
+            spread = float(np.exp(1.96 * s))
+            out[i] = Parameter(float(theta[i]), float(theta[i] / spread), float(theta[i] * spread))
     return out
 
 
