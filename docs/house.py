@@ -18,6 +18,7 @@ WORDS = {
     "montecarlo": "seeded runs, in order and reproducible",
     "metrics": "RMSE, NEES, NIS, OSPA, GOSPA, scores of tracks",
     "tracks": "gates, association, lifecycle, noise: many objects",
+    "identify": "one object or two, at a stated error",
     "filters": "what we believe: the recursion, batch and bank",
     "decisions": "which mode to announce",
     "alarms": "when to raise one",
@@ -32,7 +33,7 @@ WORDS = {
 }
 _COLOURS = (
     (("errors", "geo", "records", "io"), "#eef3ee", "#a9c2aa"),
-    (("models", "simulate", "decisions", "filters", "tracks"), "#fbeeea", "#dba792"),
+    (("models", "simulate", "decisions", "filters", "identify", "tracks"), "#fbeeea", "#dba792"),
     (("metrics", "montecarlo", "studies"), "#f3eef7", "#bfa9d1"),
     ((), "#e9f0f8", "#9db8d6"),
 )

@@ -18,6 +18,9 @@ _EXPORTS = {
     "constant_acceleration": "saltus.models",
     "constant_velocity": "saltus.models",
     "decide": "saltus.decisions",
+    "identification_llr": "saltus.identify",
+    "p_correct": "saltus.identify",
+    "p_false": "saltus.identify",
     "singer": "saltus.models",
     "LinearSensor": "saltus.models",
     "ModelError": "saltus.errors",
@@ -26,6 +29,7 @@ _EXPORTS = {
     "discretise": "saltus.models",
     "imm_filter": "saltus.filters",
     "spherical_to_cartesian": "saltus.geo",
+    "threshold": "saltus.identify",
 }
 
 __all__ = sorted(_EXPORTS)
