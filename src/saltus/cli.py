@@ -22,7 +22,8 @@ class _Group(click.Group):
             click.echo(f"saltus: {error}", err=True)
             sys.exit(2)
         except OSError as error:
-            click.echo(f"saltus: {error.strerror or error}: {error.filename}", err=True)
+            named = f": {error.filename}" if error.filename is not None else ""
+            click.echo(f"saltus: {error.strerror or error}{named}", err=True)
             sys.exit(2)
         except KeyboardInterrupt:
             click.echo("saltus: interrupted; nothing half-written was left", err=True)
@@ -60,7 +61,9 @@ def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, system
 @click.option("-o", "--output", required=True, type=_FILE, help="Output directory.")
 @click.option("--config", type=_FILE, help="TOML file: date, [[sensor]] sites and noise, tracker settings.")
 @click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
-@click.option("--identity", type=click.Choice(["use", "ignore"]), default="use", show_default=True)
+@click.option(
+    "--identity", type=click.Choice(["use", "ignore"]), default="use", show_default=True, help="Codes of the plots."
+)
 @click.option("--from", "time_from", metavar="TIME", help="First time, HH:MM[:SS] or ISO 8601, UTC.")
 @click.option("--to", "time_to", metavar="TIME", help="Last time, HH:MM[:SS] or ISO 8601, UTC.")
 @click.option("--no-report", is_flag=True, help="Do not write report.html.")
@@ -98,7 +101,7 @@ def score(output: Path, truth: Path, json_path: Path | None, cutoff: float) -> N
 @click.option("--runs", type=click.IntRange(min=2), help="Monte-Carlo runs (default: the study's own).")
 @click.option("--seed", type=int, default=0, show_default=True)
 def study(name: str, output: Path, runs: int | None, seed: int) -> None:
-    """Run the study NAME: metrics.json and pictures in OUTPUT."""
+    """Run the study NAME (coloured, fusion, jamming or radar): metrics.json and pictures in OUTPUT."""
     from saltus.progress import progress_bar
     from saltus.studies import run_study
 

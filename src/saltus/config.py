@@ -14,6 +14,7 @@ sigma_range = 30.0                # optional noise: m,
 sigma_azimuth = 0.08              # degrees,
 sigma_xy = 10.0                   # m (plane and geodetic positions),
 sigma_altitude = 8.0              # m
+period = 4.0                      # optional: s between two reports of one target
 correlation_time = 5.0            # optional: s that errors last
 
 [editions]
@@ -52,6 +53,7 @@ _HINTS = {
     "sigma_altitude": "one standard deviation in m, above 0 and up to 10000",
     "correlation_time": "s, above 0 and up to 3600",
     "name": 'text, as name = "BCN"',
+    "period": "the time between two reports of one target in s, above 0 and up to 3600",
     "date": "a date, as date = 2023-05-02",
     "editions": 'category = "edition" in quotes, as 21 = "0.23"',
 }
@@ -77,6 +79,7 @@ class SensorConfig(BaseModel):
     sigma_azimuth: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     sigma_xy: _Sigma | None = None
     sigma_altitude: _Sigma | None = None
+    period: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
     correlation_time: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
 
     @model_validator(mode="after")

@@ -21,7 +21,7 @@ from saltus.geo import Site
 from saltus.io.write import output_directory
 from saltus.progress import Progress, progress_bar
 from saltus.records import REASONS, Kind, Plots, Recording, Source
-from saltus.summary import SIGMAS, Sensors, Tracked, reported_kind, show_summary, summarise
+from saltus.summary import SIGMAS, Sensors, Tracked, noise_rows, reported_kind, show_summary, summarise
 from saltus.tracks.measurements import Measurements, default_noise, make_plane, place_plots
 from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
 from saltus.tracks.output import assignment_table, innovation_table, track_table
@@ -33,6 +33,7 @@ _Array = npt.NDArray[np.float64]
 
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 _NOISE_PLOTS = 5_000  # reports of each source that the noise is estimated from before tracking
+_DAY = 86400.0  # s
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
 
 
@@ -95,7 +96,7 @@ def track_files(
                 plots=plots,
                 assignments=assigned,
                 innovations=gates,
-                summary=summary,
+                summary={**summary, "noise": noise_rows(summary)},
                 sites=sites,
             )
     show_summary(summary, output, report)
@@ -115,6 +116,28 @@ def parse_time(text: str, start: float) -> float:
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
+def _window(time_from: str | None, time_to: str | None, start: float, end: float) -> tuple[float, float]:
+    """Read --from and --to against the span of the recording; past midnight, a time of day before is the next day's."""
+    past_midnight = np.floor(end / _DAY) > np.floor(start / _DAY)
+
+    def read(text: str, not_before: float) -> float:
+        moment = parse_time(text, start)
+        return moment + _DAY if past_midnight and "-" not in text and moment < not_before else moment
+
+    first = start if time_from is None else read(time_from, start)
+    last = end if time_to is None else read(time_to, first)
+    if first > last or first > end or last < start:
+        raise DataError(
+            f"every report is outside time window {_utc(first)} to {_utc(last)}: the recording lasts from "
+            f"{_utc(start)} to {_utc(end)} (UTC). Give --from and --to inside it, as HH:MM:SS or 2023-05-02T08:00:00."
+        )
+    return first, last
+
+
+def _utc(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
 def _prepare(
     recording: Recording, config: Config, time_from: str | None, time_to: str | None
 ) -> tuple[Plots, Sensors, list[str]]:
@@ -123,13 +146,8 @@ def _prepare(
     reason = plots.reason.copy()
     usable = (reason == 0) & np.isfinite(plots.time)
     if usable.any():
-        start = float(plots.time[usable].min())
-        outside = np.zeros(len(plots), bool)
-        if time_from is not None:
-            outside |= plots.time < parse_time(time_from, start)
-        if time_to is not None:
-            outside |= plots.time > parse_time(time_to, start)
-        reason[usable & outside] = REASONS.index("outside time window")
+        first, last = _window(time_from, time_to, float(plots.time[usable].min()), float(plots.time[usable].max()))
+        reason[usable & ((plots.time < first) | (plots.time > last))] = REASONS.index("outside time window")
     sensors = _sensors(plots.sources, recording, config)
     for s, source in enumerate(plots.sources):
         needs = (plots.source == s) & np.isin(plots.kind, (Kind.POLAR, Kind.PLANE, Kind.BEARING)) & (reason == 0)
@@ -137,6 +155,11 @@ def _prepare(
         if sensors.sites[s] is None and needs.any():
             reason[needs] = REASONS.index("site unknown")
             problems.append(_site_wanted(source, int(needs.sum())))
+        if (reason[plots.source == s] == 0).any() and np.isnan(sensors.told_periods[s]):
+            problems.append(
+                f"{source.system}: the recording does not tell the update period; {_NO_PERIOD} s is assumed. "
+                "Give period (s) in its [[sensor]] table."
+            )
     plots = replace(plots, reason=reason)
     if not (reason == 0).any():
         raise DataError(_nothing_left(plots, problems))
@@ -158,22 +181,26 @@ def _nothing_left(plots: Plots, problems: Sequence[str]) -> str:
         return "the inputs hold no target report. " + " ".join(problems)
     counts = np.bincount(plots.reason, minlength=len(REASONS))
     listed = ", ".join(f"{counts[k]} {REASONS[k]}" for k in np.argsort(-counts) if k and counts[k])
-    return f"no report can be tracked: {listed}. " + " ".join(problems)
+    if (plots.reason == REASONS.index("system track")).all():
+        listed += " (another system's tracks are shown by saltus info and never tracked again)"
+    return " ".join([f"no report can be tracked: {listed}.", *problems])
 
 
 def _sensors(sources: Sequence[Source], recording: Recording, config: Config) -> Sensors:
     sites: list[Site | None] = []
     configured: list[dict[str, float]] = []
-    periods, names = [], []
+    periods, told_periods, names = [], [], []
     for source in sources:
         sensor = config.site_for(source.system)
         sites.append(None if sensor is None else _site(sensor))
         found = [c.update_period for c in recording.contents if c.system == source.system]
         told = [p for p in found if np.isfinite(p) and p > 0]
-        periods.append(float(np.median(told)) if told else _NO_PERIOD)
+        given = None if sensor is None else sensor.period
+        told_periods.append(given or (float(np.median(told)) if told else np.nan))
+        periods.append(_NO_PERIOD if np.isnan(told_periods[-1]) else told_periods[-1])
         configured.append({} if sensor is None else _noise(sensor, periods[-1]))
         names.append(sensor.name if sensor is not None and sensor.name else str(source.system))
-    return Sensors(sites, configured, periods, names)
+    return Sensors(sites, configured, periods, told_periods, names)
 
 
 def _site(sensor: SensorConfig) -> Site | None:

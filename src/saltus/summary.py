@@ -17,8 +17,10 @@ from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
 from saltus.tracks.tracker import Assignments, Rows
 
-__all__ = ["SIGMAS", "Sensors", "Tracked", "reported_kind", "show_summary", "summarise"]
+__all__ = ["SIGMAS", "Sensors", "Tracked", "noise_rows", "reported_kind", "show_summary", "summarise"]
 
+_DOUBTFUL_NIS = 3.0  # of two degrees of freedom
+_UNITS = {"sigma_range_m": "σ of range, m", "sigma_azimuth_deg": "σ of azimuth, °", "sigma_xy_m": "σ of position, m"}
 SIGMAS = {  # by what a source reports: label, field of Noise, unit
     Kind.POLAR: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
     Kind.PLANE: (("sigma_xy_m", "xy", 1.0),),
@@ -32,7 +34,8 @@ class Sensors:
 
     sites: list[Site | None]
     configured: list[dict[str, float]]  # fields of Noise that the configuration gives
-    periods: list[float]
+    periods: list[float]  # update period used, s
+    told_periods: list[float]  # as configured or found in the recording, NaN where neither tells
     names: list[str]
 
 
@@ -80,6 +83,7 @@ def summarise(
     reasons = pc.value_counts(assigned["reason"].drop_null()).to_pylist()
     status = np.array(tracks["status"])
     ids = tracked.assignments.track_id
+    noise = _noise_table(plots, sensors, tracked)
     hours = float(np.ptp(tracked.measurements.time)) / 3600.0
     return {
         "version": version("saltus"),
@@ -95,8 +99,8 @@ def summarise(
             "updates": int((status != "coasted").sum()),
             "coasted": int((status == "coasted").sum()),
         },
-        "noise": _noise_table(plots, sensors, tracked),
-        "problems": list(problems),
+        "noise": noise,
+        "problems": [*problems, *_doubts(noise)],
     }
 
 
@@ -122,6 +126,28 @@ def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, 
         row["nis_expected"] = 2.0
         table[name if name not in table else f"{name} ({plots.sources[s].system})"] = row
     return table
+
+
+def noise_rows(summary: dict[str, Any]) -> dict[str, object]:
+    """Lay the noise table out for people: a row for each source and quantity, the same columns in all."""
+    rows: dict[str, object] = {}
+    for name, row in summary["noise"].items():
+        for label, unit in _UNITS.items():
+            if label in row:
+                figures = {"update_period_s": row["update_period_s"], "nis": row["nis_mean"]}
+                rows[f"{name}, {unit}"] = {**row[label], **figures}
+    return rows
+
+
+def _doubts(noise: dict[str, Any]) -> list[str]:
+    """Say of which sources the innovations contradict the noise used."""
+    return [
+        f"{name}: NIS {row['nis_mean']} where 2 is expected: the errors are larger than the noise used explains "
+        "(a bias between sources, or errors that last). Covariances of its tracks are too small; set its sigma or "
+        "correlation_time in the configuration."
+        for name, row in noise.items()
+        if row["nis_mean"] is not None and row["nis_mean"] > _DOUBTFUL_NIS
+    ]
 
 
 def _rounded(value: float) -> float | None:

@@ -79,6 +79,8 @@ class Plane:
     ) -> tuple[Float[np.ndarray, "*lead"], Float[np.ndarray, "*lead"]]:
         """Convergence and scale as of `factors`, at latitudes and longitudes in rad."""
         lat, lon = np.broadcast_arrays(np.asarray(latitude, np.float64), np.asarray(longitude, np.float64))
+        if not lat.size:  # PROJ refuses to answer nothing with nothing
+            return np.zeros(lat.shape), np.ones(lat.shape)
         known = np.isfinite(lat) & np.isfinite(lon)
         found = self._projection.get_factors(
             np.where(known, lon, self.longitude), np.where(known, lat, self.latitude), radians=True

@@ -12,6 +12,8 @@ from saltus.records import Contents, Plots
 __all__ = ["Part", "revisit", "scan_period"]
 
 _FEW = 5  # intervals that make a median
+_NEARLY, _MOSTLY = 0.2, 0.8  # this share of the intervals lies within that of their median: one report a scan
+_FASTEST = 0.1  # s: closer reports are those of one rotation, not of one target
 _SHARED = 0.1  # of the reports share their time with another: the source dates scans, not reports
 
 
@@ -45,7 +47,9 @@ def revisit(time: npt.ArrayLike, *identities: Int[np.ndarray, " n"]) -> float:
 
 
 def scan_period(time: npt.ArrayLike) -> float:
-    """Median time between the scans of a source that gives all reports of a scan one time, NaN where it does not.
+    """Median time between the scans of a source, where its times tell: NaN where they do not.
+
+    They tell when all reports of a scan have one time, and when single reports come at regular intervals.
 
     Args:
         time: (N,) s, NaN = unknown.
@@ -53,6 +57,10 @@ def scan_period(time: npt.ArrayLike) -> float:
     times = np.asarray(time, np.float64)
     scans, counts = np.unique(times[np.isfinite(times)], return_counts=True)
     shared = counts[counts > 1].sum()
-    if len(scans) <= _FEW or shared < _SHARED * counts.sum():
+    if len(scans) <= _FEW:
         return float("nan")
-    return float(np.median(np.diff(scans)))
+    steps = np.diff(scans)
+    median = float(np.median(steps))
+    regular = np.mean(np.abs(steps - median) < _NEARLY * median) > _MOSTLY
+    told = shared >= _SHARED * counts.sum() or (regular and median > _FASTEST)
+    return median if told else float("nan")

@@ -25,8 +25,10 @@ position, or with a number that cannot be, is kept as a report with its reason; 
 alone. Rows count from 0, without the header.
 """
 
+import csv
 import datetime
 from collections.abc import Sequence
+from io import BytesIO, StringIO
 from pathlib import Path
 
 import numpy as np
@@ -82,16 +84,45 @@ def read_csv(path: Path) -> Part:
     Raises:
         DataError: no CSV, needed columns are missing, or a column's unit cannot be right.
     """
-    from pyarrow import csv
-
+    problems: list[str] = []
     try:
-        with csv.open_csv(path) as reader:
-            names = reader.schema.names
-        as_text = csv.ConvertOptions(column_types={name: pa.string() for name in names}, strings_can_be_null=True)
-        table = csv.read_csv(path, convert_options=as_text)
+        table = _csv_as_text(path)
+        rows = np.arange(table.num_rows)
     except pa.ArrowInvalid as error:
+        whole, rows = _whole_rows(path, problems, error)
+        table = _csv_as_text(whole)
+    except (pa.ArrowException, OSError) as error:
         raise DataError(f"{path}: no readable CSV table: {str(error).splitlines()[0]}") from error
-    return _read(path, table)
+    return _read(path, table, rows, problems)
+
+
+def _csv_as_text(source: Path | BytesIO) -> pa.Table:
+    from pyarrow import csv as arrow
+
+    content = source.read_bytes() if isinstance(source, Path) else source.getvalue()
+    with arrow.open_csv(BytesIO(content)) as reader:
+        names = reader.schema.names
+    as_text = arrow.ConvertOptions(column_types={name: pa.string() for name in names}, strings_can_be_null=True)
+    return arrow.read_csv(BytesIO(content), convert_options=as_text)
+
+
+def _whole_rows(path: Path, problems: list[str], error: pa.ArrowInvalid) -> tuple[BytesIO, npt.NDArray[np.int64]]:
+    """Leave out rows whose number of cells is not the header's, and tell them; most rows must be whole."""
+    try:
+        lines = list(csv.reader(StringIO(path.read_text(encoding="utf-8"))))
+    except UnicodeDecodeError as wrong:
+        raise DataError(f"{path}: byte {wrong.start}: not UTF-8 text; save the table as UTF-8 CSV.") from wrong
+    header, body = (lines[0], lines[1:]) if lines else ([], [])
+    whole = [k for k, cells in enumerate(body) if len(cells) == len(header)]
+    if len(whole) <= len(body) // 2:
+        raise DataError(f"{path}: no readable CSV table: {str(error).splitlines()[0]}") from error
+    for k in sorted(set(range(len(body))) - set(whole)):
+        problems.append(
+            f"{path}: row {k}: {len(body[k])} cells where the header has {len(header)}; the row is left out."
+        )
+    text = StringIO()
+    csv.writer(text).writerows([header, *(body[k] for k in whole)])
+    return BytesIO(text.getvalue().encode()), np.array(whole, np.int64)
 
 
 def read_parquet(path: Path) -> Part:
@@ -104,12 +135,12 @@ def read_parquet(path: Path) -> Part:
 
     try:
         table = parquet.read_table(path)
-    except pa.ArrowInvalid as error:
+    except (pa.ArrowException, OSError) as error:
         raise DataError(f"{path}: no readable Parquet table: {str(error).splitlines()[0]}") from error
-    return _read(path, table)
+    return _read(path, table, np.arange(table.num_rows), [])
 
 
-def _read(path: Path, table: pa.Table) -> Part:
+def _read(path: Path, table: pa.Table, rows: npt.NDArray[np.int64], problems: list[str]) -> Part:
     table = table.rename_columns(
         [_ALIASES.get(c, c) if _ALIASES.get(c) not in table.column_names else c for c in table.column_names]
     )
@@ -120,7 +151,6 @@ def _read(path: Path, table: pa.Table) -> Part:
     _need_columns(path, names)
     if not table.num_rows:
         raise DataError(f"{path}: row 0: the table has columns and no row.")
-    problems: list[str] = []
     columns: dict[str, npt.ArrayLike] = {"time": _times(path, table["time"], problems)}
     for name, (target, factor) in _NUMBERS.items():
         if name in names:
@@ -137,7 +167,7 @@ def _read(path: Path, table: pa.Table) -> Part:
         columns["kind"] = _stated_kinds(path, table["kind"], columns["kind"], problems)
     _check_units(path, columns)
     _tell_impossible(path, columns, problems)
-    return _part(path, table, observer_columns(path, columns), problems)
+    return _part(path, table, {**observer_columns(path, columns), "record": rows}, problems)
 
 
 def _need_columns(path: Path, names: Sequence[str]) -> None:
@@ -309,16 +339,19 @@ def _part(path: Path, table: pa.Table, columns: dict[str, npt.ArrayLike], proble
     labels = [str(v) if v not in (None, "") else path.stem for v in named]
     systems = [System(None, None, None, label) for label in sorted(set(labels))]
     position = {s.name: k for k, s in enumerate(systems)}
-    columns |= {"source": [position[label] for label in labels], "file": np.zeros(n), "record": np.arange(n)}
+    columns |= {"source": [position[label] for label in labels], "file": np.zeros(n)}
     plots = Plots.build(n, tuple(Source(s) for s in systems), (path.name,), columns)
     unused = [c for c in table.column_names if c not in _COLUMNS]
     notes = (f"columns not used: {', '.join(unused)}",) if unused else ()
-    contents = tuple(_contents(path, s, plots.take(plots.source == k), table, notes) for k, s in enumerate(systems))
+    of_system = [np.flatnonzero(plots.source == k) for k in range(len(systems))]
+    contents = tuple(
+        _contents(path, s, plots.take(at), table.take(at), notes) for s, at in zip(systems, of_system, strict=True)
+    )
     return Part(plots, None, contents, tuple(problems), in_order=False, dated=True)
 
 
 def _contents(path: Path, system: System, own: Plots, table: pa.Table, notes: tuple[str, ...]) -> Contents:
-    given = {c: table[c].take(pa.array(own.record)) for c in table.column_names if c in _COLUMNS}
+    given = {c: table[c] for c in table.column_names if c in _COLUMNS}
     times = own.time[np.isfinite(own.time)]
     period = revisit(own.time, own.icao24, own.mode3a)
     kinds = {

@@ -118,7 +118,7 @@ def _header(
         ("Target reports read", show(read), ""),
         ("On a track", show(used), f"{used / read:.1%}" if read else ""),
         ("Rejected or unused", show(read - used), f"{(read - used) / read:.1%}" if read else ""),
-        ("Confirmed tracks", show(n_confirmed), f"of {show(len(updates.rows))} started"),
+        ("Confirmed tracks", show(n_confirmed), ""),
         ("Systems", show(len(plots.sources)), ""),
     ]
     span = time_span(plots, updates)

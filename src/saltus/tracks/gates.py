@@ -153,6 +153,7 @@ class Gate:
         keep = np.where(life.status[pairs.track] == SEED, dt > 0.0, dt > _LATEST)
         if self._use_identity:
             keep &= ~conflicting(life.icao24[pairs.track], m.icao24[plot])
+            keep &= (life.icao24[pairs.track] >= 0) | ~life.holds(m.icao24[plot])  # an address goes to its own track
         return Pairs(pairs.track[keep], pairs.plot[keep])
 
     def _same_address(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> npt.NDArray[np.bool_]:

@@ -119,9 +119,12 @@ class TrackerSettings:
                 f"tracker.confirm_hits of confirm_scans (M of N) needs 1 <= M <= N <= 32, "
                 f"got {self.confirm_hits} of {self.confirm_scans}."
             )
-        if self.clutter_density is not None and not self.clutter_density > 0:
-            raise ModelError(f"tracker.clutter_density must be positive, got {self.clutter_density}.")
-        positive = ("clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds")
-        for name in (*positive, "split_range", "split_azimuth"):
-            if not getattr(self, name) > 0:
-                raise ModelError(f"tracker.{name} must be positive, got {getattr(self, name)}.")
+        positive = ("clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds", "split_range")
+        outliers = ("split_azimuth", "outlier_azimuth", "outlier_range", "outlier_xy", "sigma_pressure")
+        given = {name: getattr(self, name) for name in (*positive, *outliers)}
+        given["height_prior[1]"] = self.height_prior[1]
+        if self.clutter_density is not None:
+            given["clutter_density"] = self.clutter_density
+        for name, value in given.items():
+            if not 0.0 < value < np.inf:
+                raise ModelError(f"tracker.{name} must be positive and finite, got {value}.")
