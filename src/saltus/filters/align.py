@@ -124,20 +124,14 @@ def align(
 ) -> Aligned:
     """Validate the arguments of a batch filter and give every array its full set of axes.
 
-    With `defer`, the elements of large model arrays given per run are not looked at: the compiled kernel reports
-    doubtful ones as it loads them, and its caller aligns again without `defer`.
+    With `defer`, the elements of z (NaN stays NaN, `seen` says nothing) and of large model arrays given per run are
+    not looked at: the compiled kernel reports doubtful ones as it loads them, and its caller aligns again without.
 
     Raises:
         ModelError: a shape that fits no reading, probabilities that are none, a covariance that is none.
         DataError: inf in z, or NaN or inf elsewhere.
     """
-    z_in = np.asarray(z, dtype=np.float64)
-    if z_in.ndim < 2 or z_in.shape[-2] == 0 or z_in.shape[-1] == 0:
-        raise DataError(f"z has shape {z_in.shape}; it is (*batch, T, m) with T and m at least 1.")
-    if np.isinf(z_in).any():
-        where = tuple(int(i) for i in np.argwhere(np.isinf(z_in))[0])
-        raise DataError(f"z{list(where)} is infinite. A missing component is NaN.")
-    seen = ~np.isnan(z_in)
+    z_in, seen = _measurements(z, defer)
     m = z_in.shape[-1]
     if np.ndim(cov0) < 2:
         raise ModelError(f"cov0 has shape {np.shape(cov0)}; it is a covariance matrix, (n, n), per mode or per run.")
@@ -148,7 +142,7 @@ def align(
             raise ModelError(f"trans[{c}] has shape {t.shape}; a transition matrix is square, (M, M).")
     reader = _Reader(z_in.shape[:-2], z_in.shape[-2], tuple(t.shape[-1] for t in matrices), defer)
     return Aligned(
-        z=np.where(seen, z_in, 0.0),
+        z=z_in,
         seen=seen,
         F=reader.model("F", F, (n, n)),
         Q=reader.covariance("Q", Q, (n, n)),
@@ -161,6 +155,19 @@ def align(
         mean0=reader.prior("mean0", mean0, (n,)),
         cov0=_covariance("cov0", reader.prior("cov0", cov0, (n, n))),
     )
+
+
+def _measurements(z: npt.ArrayLike, defer: bool) -> tuple[_Array, npt.NDArray[np.bool_]]:
+    z_in = np.asarray(z, dtype=np.float64)
+    if z_in.ndim < 2 or z_in.shape[-2] == 0 or z_in.shape[-1] == 0:
+        raise DataError(f"z has shape {z_in.shape}; it is (*batch, T, m) with T and m at least 1.")
+    if defer:
+        return z_in, np.broadcast_to(np.True_, z_in.shape)
+    if np.isinf(z_in).any():
+        where = tuple(int(i) for i in np.argwhere(np.isinf(z_in))[0])
+        raise DataError(f"z{list(where)} is infinite. A missing component is NaN.")
+    seen = ~np.isnan(z_in)
+    return np.where(seen, z_in, 0.0), seen
 
 
 def _finite(name: str, value: npt.ArrayLike) -> _Array:

@@ -17,7 +17,7 @@ __all__ = ["NativeStore", "filter_native"]
 _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
 
-_NOT_POSITIVE, _DOUBTFUL = 1, 4  # bits of the kernel's status
+_NOT_POSITIVE, _INFINITE, _DOUBTFUL = 1, 2, 4  # bits of the kernel's status
 _WRITTEN = ("probs", "mean", "cov", "log_likelihood", "nis", "n_observed", "mode_means", "mode_covs")
 
 
@@ -35,7 +35,7 @@ def filter_native(
     """
     model = aligned(True)
     out, status = _run(z, model, per_mode, every, num_threads)
-    if status & _DOUBTFUL:  # read every element: raises, or makes nearly symmetric covariances symmetric
+    if status & (_DOUBTFUL | _INFINITE):  # read every element: raises, or makes nearly symmetric covariances symmetric
         model = aligned(False)
         out, status = _run(z, model, per_mode, every, num_threads)
     if status & _NOT_POSITIVE:
@@ -67,6 +67,7 @@ def _run(z: _Array, model: Aligned, per_mode: bool, every: bool, num_threads: in
 def _allocate(
     batch: tuple[int, ...], kept: int, n_steps: int, sizes: tuple[int, ...], n: int, per_mode: bool
 ) -> Estimates:
+    # Arrays apart: the allocator gives the smaller ones out again without new pages, which one large piece forgoes.
     rows = (*batch, kept)
     return Estimates(
         probs=np.empty((*rows, *sizes)),
