@@ -73,3 +73,15 @@ def test_near_pairs_are_those_of_a_loop(rng):
 def test_near_pairs_of_few(n_tracks, n_plots):
     found = near_pairs(np.zeros((n_tracks, 2)), np.ones(n_tracks), np.full((n_plots, 2), 5.0))
     assert len(found.track) == len(found.plot) == 0  # none there, or none within reach
+
+
+def test_clusters_told_apart_give_the_same_total(rng, monkeypatch):
+    """Large scenes are solved cluster by cluster, small ones at once: one optimum."""
+    pairs = Pairs(rng.integers(0, 60, 150), rng.integers(0, 60, 150))
+    pairs = Pairs(*np.unique(np.stack(pairs), axis=1))
+    gain = rng.normal(3.0, 4.0, len(pairs.track))
+    at_once = assign(pairs, gain)
+    monkeypatch.setattr("saltus.tracks.associate._AT_ONCE", 0)
+    apart = assign(pairs, gain)
+    assert gain[apart].sum() == pytest.approx(gain[at_once].sum(), rel=1e-12)
+    assert len(np.unique(pairs.track[apart])) == len(np.unique(pairs.plot[apart])) == len(apart)

@@ -11,6 +11,9 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
 
+_AT_ONCE = 4096  # elements of a matrix up to which its clusters are not told apart
+
+
 class Pairs(NamedTuple):
     """Candidate pairs: positions in the lists of tracks and plots they were made from."""
 
@@ -73,24 +76,30 @@ def assign(pairs: Pairs, gain: _Array) -> _Index:
 
 
 def _solve(pairs: Pairs, gain: _Array, contested: _Index) -> list[_Index]:
-    from scipy.optimize import linear_sum_assignment
+    tracks, track_idx = np.unique(pairs.track[contested], return_inverse=True)
+    plots, plot_idx = np.unique(pairs.plot[contested], return_inverse=True)
+    if len(tracks) * len(plots) <= _AT_ONCE:  # clusters are blocks of one matrix, and its optimum theirs
+        return [_best(track_idx, plot_idx, gain, contested)]
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    tracks, track_idx = np.unique(pairs.track[contested], return_inverse=True)
-    plots, plot_idx = np.unique(pairs.plot[contested], return_inverse=True)
     size = len(tracks) + len(plots)
     links = coo_array((np.ones(len(contested)), (track_idx, len(tracks) + plot_idx)), shape=(size, size))
     _, label = connected_components(links, directed=False)
-    chosen = []
     order = np.argsort(label[track_idx], kind="stable")
-    for members in np.split(order, np.flatnonzero(np.diff(label[track_idx][order])) + 1):
-        rows, row = np.unique(track_idx[members], return_inverse=True)
-        cols, col = np.unique(plot_idx[members], return_inverse=True)
-        matrix = np.zeros((len(rows), len(cols)))  # 0 = both left alone
-        which = np.full(matrix.shape, -1)
-        matrix[row, col], which[row, col] = gain[contested[members]], contested[members]
-        r, c = linear_sum_assignment(matrix, maximize=True)
-        picked = which[r, c]
-        chosen.append(picked[picked >= 0])
-    return chosen
+    clusters = np.split(order, np.flatnonzero(np.diff(label[track_idx][order])) + 1)
+    return [_best(track_idx[c], plot_idx[c], gain, contested[c]) for c in clusters]
+
+
+def _best(track: _Index, plot: _Index, gain: _Array, pairs: _Index) -> _Index:
+    """Return the pairs of greatest total gain, as a rectangular assignment in which 0 leaves both alone."""
+    from scipy.optimize import linear_sum_assignment
+
+    rows, row = np.unique(track, return_inverse=True)
+    cols, col = np.unique(plot, return_inverse=True)
+    matrix = np.zeros((len(rows), len(cols)))
+    which = np.full(matrix.shape, -1)
+    matrix[row, col], which[row, col] = gain[pairs], pairs
+    r, c = linear_sum_assignment(matrix, maximize=True)
+    picked = which[r, c]
+    return picked[picked >= 0]
