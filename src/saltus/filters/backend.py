@@ -36,7 +36,7 @@ def native_module() -> ModuleType | None:
                 "SALTUS_REQUIRE_NATIVE=1, but saltus was installed without its compiled kernel "
                 f"({error}). Install a C++20 compiler and reinstall saltus."
             ) from error
-        logging.getLogger("saltus").info("the compiled kernel is absent (%s): filters run in NumPy", error)
+        logging.getLogger("saltus").warning("the compiled kernel is absent (%s): filters run in NumPy", error)
         return None
     return _native
 
