@@ -228,7 +228,9 @@ def main() -> None:
     parser.add_argument("reference", type=Path, help="Parquet table of the same reports with BDS 5,0")
     parser.add_argument("--config", type=Path, required=True, help="sensors.toml of the recording")
     parser.add_argument("--identity", choices=["use", "ignore"], default="ignore")
-    parser.add_argument("--json", type=Path, default=Path(__file__).with_name("results_tracking.json"), help="where to write")
+    parser.add_argument(
+        "--json", type=Path, default=Path(__file__).with_name("results_tracking.json"), help="where to write"
+    )
     given = parser.parse_args()
     run = track(given.recording, given.config, given.identity)
     figures = [*association(run), *motion(run, given.reference), *cost(run)]
