@@ -7,6 +7,7 @@ from typing import Any
 _EXPORTS = {
     "Chain": "saltus.models",
     "DataError": "saltus.errors",
+    "DiffusionSensor": "saltus.models",
     "Estimates": "saltus.filters",
     "Gaussian": "saltus.models",
     "HybridModel": "saltus.models",
@@ -15,6 +16,7 @@ _EXPORTS = {
     "PositionSensor": "saltus.models",
     "Record": "saltus.filters",
     "coloured_filter": "saltus.filters",
+    "SwitchingSDE": "saltus.models",
     "constant_acceleration": "saltus.models",
     "constant_velocity": "saltus.models",
     "decide": "saltus.decisions",

@@ -8,12 +8,15 @@ from saltus.models.augment import Treatment, augmented, treatment
 from saltus.models.chain import Chain
 from saltus.models.coloured import ColouredSensor
 from saltus.models.conditions import OK, Condition, FaultySensor, lost, outliers
+from saltus.models.diffusion import SwitchingSDE
+from saltus.models.diffusion_sensor import DiffusionSensor
 from saltus.models.drawing import diagram
 from saltus.models.dynamics import Dynamics, LinearSDE, LinearTransition, Step
 from saltus.models.exponential import discretise, exponential
 from saltus.models.findings import Finding
 from saltus.models.gaussian import Gaussian
 from saltus.models.hybrid import HybridModel
+from saltus.models.lowering import as_diffusion
 from saltus.models.motion import Motion, constant_acceleration, constant_velocity, singer
 from saltus.models.noise import MarkovNoise, first_order, second_order
 from saltus.models.nonlinear import FunctionSensor
@@ -29,6 +32,7 @@ __all__ = [
     "Chain",
     "ColouredSensor",
     "Condition",
+    "DiffusionSensor",
     "Dynamics",
     "FaultySensor",
     "Finding",
@@ -46,7 +50,9 @@ __all__ = [
     "PositionSensor",
     "Sensor",
     "Step",
+    "SwitchingSDE",
     "Treatment",
+    "as_diffusion",
     "augmented",
     "constant_acceleration",
     "constant_velocity",

@@ -117,6 +117,17 @@ class Chain:
         return np.asarray(self.initial)
 
     @property
+    def generator(self) -> Float[np.ndarray, "m m"]:
+        """Rates of the jumps, (M, M), 1/s: as given, or the logarithm of `trans` per `per` seconds.
+
+        Raises:
+            ModelError: there are none, because the chain jumps per step.
+        """
+        if self._rates is None:
+            raise ModelError(f"chain {self.name!r} has no rates per second: give sojourn=, rates=, or per= with trans.")
+        return self._rates
+
+    @property
     def memoryless(self) -> bool:
         """Whether the next state does not depend on the present one (all rows of `trans` equal)."""
         if self.trans is None:
