@@ -49,3 +49,59 @@ def case(name):
 
 def range_bearing(y):
     return np.stack([np.hypot(y[..., 0], y[..., 1]), np.arctan2(y[..., 1], y[..., 0])], axis=-1)
+
+
+def exact_mixture(z, times, rng, n_paths):
+    """Posterior of case b at the last time by drawing switching paths: given a path all is Gaussian.
+
+    The forcing is +1 in mode 0 and -1 in mode 1; Y - m given the path is an Ornstein-Uhlenbeck process of unit rate,
+    so that only the mean depends on the path. Returns P(mode 0), mean and variance, and their standard errors.
+    """
+    T, end = len(times), times[-1]
+    dt = times[:, None] - times[None, :]
+    within = 0.08 * (np.exp(-np.abs(dt)) - np.exp(-(times[:, None] + times[None, :])))
+    C = within + np.exp(-(times[:, None] + times[None, :]))  # the start has variance 1
+    S = C + 0.49 * np.eye(T)
+    mode = rng.integers(0, 2, n_paths)
+    mean, at, now = np.zeros((n_paths, T)), np.zeros(n_paths), mode.copy()
+    now_at = np.zeros((n_paths, T), int)
+    while (at < end).any():
+        leave = at + rng.exponential(1 / 0.4, n_paths)
+        for k, t in enumerate(times):
+            a, b = np.minimum(at, t), np.minimum(leave, t)
+            mean[:, k] += np.where(now == 0, 1.0, -1.0) * (np.exp(-(t - b)) - np.exp(-(t - a)))
+            now_at[:, k] = np.where((at <= t) & (t < leave), now, now_at[:, k])
+        at, now = leave, 1 - now
+    nu = z - mean
+    log_w = -0.5 * np.einsum("pi,ij,pj->p", nu, np.linalg.inv(S), nu)
+    w = np.exp(log_w - log_w.max())
+    w /= w.sum()
+    gain = np.linalg.solve(S, C[:, -1])
+    y = mean[:, -1] + nu @ gain
+    first = w @ (now_at[:, -1] == 0)
+    m = w @ y
+    var = C[-1, -1] - C[-1] @ gain + w @ (y - m) ** 2
+    spread = lambda f, value: np.sqrt(np.sum(w**2 * (f - value) ** 2))  # noqa: E731
+    errors = spread(now_at[:, -1] == 0, first), spread(y, m), spread((y - m) ** 2, w @ (y - m) ** 2)
+    return np.array([first, m, var]), np.array(errors)
+
+
+def distances(estimates, case):
+    """Rms error of the mean in posterior standard deviations, mean covariance error, rms error of P(mode 0)."""
+    cov = case["grid_cov"] if "grid_cov" in case else case["grid_var"][..., None, None]
+    mean = case["grid_mean"] if "grid_cov" in case else case["grid_mean"][..., None]
+    off = (estimates.mean - mean) / np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    size = np.linalg.norm(cov, axis=(-2, -1))
+    return (
+        np.sqrt(np.mean(off**2)),
+        np.mean(np.linalg.norm(estimates.cov - cov, axis=(-2, -1)) / size),
+        np.sqrt(np.mean((estimates.probs[..., 0] - case["grid_prob1"]) ** 2)),
+    )
+
+
+def few(case, runs, steps):
+    """A part of a reference case, its z with a component axis."""
+    part = {k: v[:steps] if k == "times" else v[:runs, :steps] for k, v in case.items()}
+    if part["z"].ndim == 2:
+        part["z"] = part["z"][..., None]
+    return part

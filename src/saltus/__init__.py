@@ -10,6 +10,7 @@ _EXPORTS = {
     "DiffusionSensor": "saltus.models",
     "Estimates": "saltus.filters",
     "Gaussian": "saltus.models",
+    "GridFilter": "saltus.filters",
     "HybridModel": "saltus.models",
     "IMM": "saltus.filters",
     "LinearSDE": "saltus.models",

@@ -45,6 +45,7 @@ def test_functions_and_constants_give_the_same_fields(rng):
         np.testing.assert_allclose(model.covariance_at(0, x), np.broadcast_to(B @ B.T, (4, 3, 2, 2)), rtol=1e-15)
     scalar = one_mode(diffusion=[0.5], **common)
     np.testing.assert_array_equal(scalar.diffusion_at(0, x[0, 0]), 0.5 * np.eye(2))
+    np.testing.assert_array_equal(scalar.covariance_at(0, x)[1, 1], 0.25 * np.eye(2))
 
 
 def test_rates_add_up_to_the_exit_rate(rng):

@@ -106,9 +106,8 @@ class SwitchingSDE:
 
     def covariance_at(self, mode: int, x: Float[np.ndarray, "*lead n"]) -> Float[np.ndarray, "*lead n n"]:
         """B = b b' of a mode at states (..., n)."""
-        field = self.diffusion[mode]
-        if not callable(field):
-            b = np.asarray(field)
+        if not callable(self.diffusion[mode]):
+            b = self.diffusion_at(mode, self.means0[mode])
             return np.broadcast_to(b @ b.T, (*np.shape(x), self.n_state))
         b = self.diffusion_at(mode, x)
         return np.asarray(b @ b.swapaxes(-1, -2))

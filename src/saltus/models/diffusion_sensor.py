@@ -133,7 +133,7 @@ class DiffusionSensor:
             d2 = np.square(nu @ L_inv.T).sum(-1)
             logdet = -2.0 * np.log(np.diagonal(L_inv)).sum()
         else:
-            d2, logdet, _ = gaussian_terms(nu, R)
+            d2, logdet, _ = gaussian_terms(nu, np.broadcast_to(R, (*nu.shape, nu.shape[-1])))
         return np.asarray(-0.5 * (d2 + logdet + seen.sum(-1) * _LOG_2PI))
 
     def _increment(self, z: FloatArray, seen: np.ndarray, expected: FloatArray, dt: float) -> FloatArray:

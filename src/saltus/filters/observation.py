@@ -1,0 +1,99 @@
+"""What the filters of switching diffusions share: reading their arguments, and the innovation of a weighted sum."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from jaxtyping import Bool, Float
+
+from saltus.errors import DataError, ModelError
+from saltus.linalg import gaussian_terms
+from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE, as_diffusion
+
+__all__ = ["Observation", "innovation_nis", "observation"]
+
+
+class Observation(NamedTuple):
+    """A model, its sensor, and B runs of measurements at T times, checked."""
+
+    model: SwitchingSDE
+    sensor: DiffusionSensor
+    z: Float[np.ndarray, "b t m"]
+    dts: Float[np.ndarray, " t"]  # interval before each measurement, s
+    times: Float[np.ndarray, " t"]
+    batch: tuple[int, ...]
+
+    @property
+    def seen(self) -> Bool[np.ndarray, "b t m"]:
+        """Which components were measured."""
+        return np.asarray(~np.isnan(self.z))
+
+
+def observation(
+    model: SwitchingSDE | HybridModel,
+    sensor: DiffusionSensor | str | Sequence[str] | None,
+    z: npt.ArrayLike,
+    times: npt.ArrayLike,
+    t0: float,
+) -> Observation:
+    """Check the arguments of `run`; a hybrid model is lowered, and its sensor given by name.
+
+    Raises:
+        ModelError: model and sensor do not fit, or are of different kinds.
+        DataError: shapes do not fit, times decrease or precede t0, or z holds an infinity.
+    """
+    if isinstance(model, HybridModel):
+        if isinstance(sensor, DiffusionSensor):
+            raise ModelError("a hybrid model has its own sensors: give a name, or None for all, stacked.")
+        model, sensor = as_diffusion(model, sensor)
+    if not isinstance(sensor, DiffusionSensor):
+        raise ModelError(f"a switching diffusion needs a DiffusionSensor, got {type(sensor).__name__}.")
+    m = sensor.check(model.means0)
+    seen, t = np.asarray(z, dtype=np.float64), np.asarray(times, dtype=np.float64)
+    if seen.ndim < 2 or t.shape != seen.shape[-2:-1] or seen.shape[-1] != m or not len(t):
+        raise DataError(f"z must be (..., T, {m}) for T times (T,), T >= 1; got z {seen.shape} and times {t.shape}.")
+    if np.isinf(seen).any():
+        raise DataError(f"z holds infinity at {np.argwhere(np.isinf(seen))[0].tolist()}; a missing component is NaN.")
+    dts = np.diff(t, prepend=t0)
+    if not np.isfinite(dts).all() or dts.min() < 0:
+        raise DataError(
+            f"times must not decrease, nor precede t0 = {t0:g} s: row {int(dts.argmin())} comes "
+            f"{-dts.min():g} s too early. Sort by time, or say when the prior holds: t0=."
+        )
+    return Observation(model, sensor, seen.reshape(-1, *seen.shape[-2:]), dts, t, seen.shape[:-2])
+
+
+def innovation_nis(
+    sensor: DiffusionSensor,
+    z: Float[np.ndarray, "b m"],
+    dt: float,
+    nodes: Sequence[tuple[Float[np.ndarray, "*lead n"], Float[np.ndarray, "b q"]]],
+) -> Float[np.ndarray, " b"]:
+    """Nu' S^-1 nu of the predicted measurement, nu and S the moments of z - h(x) over weighted nodes.
+
+    Args:
+        sensor: what is measured.
+        z: one measurement of each run; NaN is missing.
+        dt: the interval, for a continuous sensor.
+        nodes: per mode the states (q, n) or (b, q, n) and their probabilities (b, q), which sum to 1 over all modes.
+    """
+    seen = ~np.isnan(z)
+    filled = np.where(seen, z, 0.0)[:, None]
+    m = z.shape[-1]
+    nu, S = np.zeros((len(z), m)), np.zeros((len(z), m, m))
+    for mode, (x, weight) in enumerate(nodes):
+        h = sensor.h_at(mode, x)
+        off = filled - dt * h if sensor.continuous else sensor.residual(filled, h)
+        weighted = weight[..., None] * off
+        nu += weighted.sum(1)
+        S += np.swapaxes(weighted, -1, -2) @ off
+        noise = sensor.R[mode]
+        if callable(noise):
+            S += np.einsum("bq,...qij->bij", weight, sensor.noise_at(mode, x))
+        else:
+            S += weight.sum(-1)[:, None, None] * np.asarray(noise) * (dt if sensor.continuous else 1.0)
+    S -= nu[:, :, None] * nu[:, None, :]
+    both = seen[:, :, None] & seen[:, None, :]
+    S = np.where(both, S, np.eye(m))
+    return np.where(seen.any(-1), gaussian_terms(np.where(seen, nu, 0.0), S)[0], 0.0)
