@@ -81,7 +81,7 @@ def test_clusters_told_apart_give_the_same_total(rng, monkeypatch):
     pairs = Pairs(*np.unique(np.stack(pairs), axis=1))
     gain = rng.normal(3.0, 4.0, len(pairs.track))
     at_once = assign(pairs, gain)
-    monkeypatch.setattr("saltus.tracks.associate._AT_ONCE", 0)
+    monkeypatch.setattr("saltus.identify.assignment._AT_ONCE", 0)
     apart = assign(pairs, gain)
     assert gain[apart].sum() == pytest.approx(gain[at_once].sum(), rel=1e-12)
     assert len(np.unique(pairs.track[apart])) == len(np.unique(pairs.plot[apart])) == len(apart)
