@@ -19,8 +19,8 @@ def candidate_pairs(
     """Return the pairs of tracks that lay within reach of each other at some time while both lived.
 
     Both systems are laid out at common times, at which positions are interpolated between a track's measurements, and
-    a tree finds what is near. At the ends of a track, where a common time lies up to `every` / 2 outside of it, the
-    reach grows by the way an object of three `speed_sigma` makes.
+    a tree finds what is near. Tracks that lived together between common times only are compared at the nearest one,
+    with a reach that grows by the way an object of three `speed_sigma` makes.
 
     Args:
         a: tracks of one system.
@@ -57,12 +57,13 @@ def candidate_pairs(
         return np.zeros((0, 2), np.int64)
     i = np.concatenate([np.asarray(f, dtype=np.int64) for f in found if f])
     j = np.repeat(np.arange(len(found)), count)
-    near = np.hypot(*(at_a[i] - at_b[j]).T) <= reach + speed * (loose_a[i] + loose_b[j])
-    pairs = np.unique(np.column_stack([owner_a[i[near]], owner_b[j[near]]]), axis=0)
-    lived = np.maximum(spans_a.begin[pairs[:, 0]], spans_b.begin[pairs[:, 1]]) <= np.minimum(
-        spans_a.end[pairs[:, 0]], spans_b.end[pairs[:, 1]]
-    )
-    return np.asarray(pairs[lived])
+    begin = np.maximum(spans_a.begin[owner_a[i]], spans_b.begin[owner_b[j]])
+    end = np.minimum(spans_a.end[owner_a[i]], spans_b.end[owner_b[j]])
+    met = np.floor((end - start) / every) >= np.ceil((begin - start) / every)  # both lived at a common time
+    loose = loose_a[i] + loose_b[j]
+    near = np.hypot(*(at_a[i] - at_b[j]).T) <= reach + speed * loose
+    near &= (begin <= end) & ((loose == 0.0) | ~met)
+    return np.unique(np.column_stack([owner_a[i[near]], owner_b[j[near]]]), axis=0)
 
 
 def _sampled(
