@@ -3,6 +3,8 @@
 from saltus.identify.decide import Decisions, DecisionSettings, Episodes, decide_pairs
 from saltus.identify.evidence import APART, Evidence, as_evidence, join_evidence, pair_evidence
 from saltus.identify.groups import Conflict
+from saltus.identify.matched import PairDraws, Schedule, different_pairs, same_pairs, wide_spreads
+from saltus.identify.neyman import FalseRatios, false_ratios, filled
 from saltus.identify.pairs import LocalTracks, PairSettings, Ratios, candidate_pairs, pair_ratios
 from saltus.identify.ratio import RatioTerms, identification_llr, identification_terms
 from saltus.identify.static import p_correct, p_false, separation, threshold
@@ -28,14 +30,20 @@ __all__ = [
     "Decisions",
     "Episodes",
     "Evidence",
+    "FalseRatios",
     "LocalTracks",
+    "PairDraws",
     "PairSettings",
     "RatioTerms",
     "Ratios",
+    "Schedule",
     "Verdict",
     "as_evidence",
     "candidate_pairs",
     "decide_pairs",
+    "different_pairs",
+    "false_ratios",
+    "filled",
     "identification_llr",
     "identification_terms",
     "join_evidence",
@@ -46,8 +54,10 @@ __all__ = [
     "pair_ratios",
     "posterior",
     "same_object",
+    "same_pairs",
     "separation",
     "sprt",
     "sprt_bounds",
     "threshold",
+    "wide_spreads",
 ]

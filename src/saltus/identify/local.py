@@ -86,6 +86,11 @@ class PairSettings:
     def __eq__(self, other: object) -> bool:
         return same(self, other)
 
+    def __hash__(self) -> int:
+        arrays = (self.offset_cov, self.region_mean, self.region_cov)
+        plain = (self.accel, self.sojourn, self.accel_time, self.offset_time, self.speed_sigma)
+        return hash((*plain, *(np.asarray(a).tobytes() for a in arrays)))
+
     def chain(self) -> Chain:
         """Return the chain of manoeuvres; its states hold the spectral density of acceleration, m^2/s^3."""
         density = {f"level{i}": a * a * self.accel_time for i, a in enumerate(self.accel)}
