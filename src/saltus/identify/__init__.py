@@ -8,6 +8,7 @@ from saltus.identify.neyman import FalseRatios, false_ratios, filled
 from saltus.identify.pairs import LocalTracks, PairSettings, Ratios, candidate_pairs, pair_ratios
 from saltus.identify.ratio import RatioTerms, identification_llr, identification_terms
 from saltus.identify.static import p_correct, p_false, separation, threshold
+from saltus.identify.tracklets import doubled, track_updates, tracklets
 from saltus.identify.verdict import (
     DIFFERENT,
     SAME,
@@ -42,6 +43,7 @@ __all__ = [
     "candidate_pairs",
     "decide_pairs",
     "different_pairs",
+    "doubled",
     "false_ratios",
     "filled",
     "identification_llr",
@@ -59,5 +61,7 @@ __all__ = [
     "sprt",
     "sprt_bounds",
     "threshold",
+    "track_updates",
+    "tracklets",
     "wide_spreads",
 ]
