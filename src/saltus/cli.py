@@ -101,7 +101,7 @@ def score(output: Path, truth: Path, json_path: Path | None, cutoff: float) -> N
 @click.option("--runs", type=click.IntRange(min=2), help="Monte-Carlo runs (default: the study's own).")
 @click.option("--seed", type=int, default=0, show_default=True)
 def study(name: str, output: Path, runs: int | None, seed: int) -> None:
-    """Run the study NAME (coloured, fusion, jamming or radar): metrics.json and pictures in OUTPUT."""
+    """Run the study NAME (coloured, fusion, identification, jamming or radar): metrics.json and pictures in OUTPUT."""
     from saltus.progress import progress_bar
     from saltus.studies import run_study
 

@@ -9,6 +9,7 @@ from saltus.errors import ModelError
 from saltus.io.write import output_directory
 from saltus.studies.coloured_report import coloured_study
 from saltus.studies.fusion_report import fusion_study
+from saltus.studies.identification_report import identification_study
 from saltus.studies.jamming_report import jamming_study
 from saltus.studies.radar_report import radar_study
 
@@ -28,6 +29,7 @@ class Study(Protocol):
 STUDIES: dict[str, Study] = {
     "coloured": coloured_study,
     "fusion": fusion_study,
+    "identification": identification_study,
     "jamming": jamming_study,
     "radar": radar_study,
 }
