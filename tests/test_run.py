@@ -36,7 +36,7 @@ TRACKS = {
     **dict.fromkeys(["track_id"], pa.int64()),
     **dict.fromkeys(["time", "latitude", "longitude", "altitude", "ve", "vn", "vu", "course_deg"], pa.float64()),
     **dict.fromkeys(["speed_mps", "cov_ee", "cov_en", "cov_nn", "cov_uu"], pa.float64()),
-    **dict.fromkeys(["cov_veve", "cov_vevn", "cov_vnvn", "p_manoeuvre_h", "p_manoeuvre_v"], pa.float64()),
+    **dict.fromkeys(["cov_veve", "cov_vevn", "cov_vnvn", "p_manoeuvre_h", "p_manoeuvre_v", "p_fault"], pa.float64()),
     **dict.fromkeys(["status", "icao24", "mode3a", "callsign"], pa.string()),
 }
 

@@ -25,6 +25,7 @@ from saltus.summary import SIGMAS, Sensors, Tracked, noise_rows, reported_kind, 
 from saltus.tracks.measurements import Measurements, default_noise, make_plane, place_plots
 from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
 from saltus.tracks.output import assignment_table, innovation_table, track_table
+from saltus.tracks.settings import TrackerSettings
 from saltus.tracks.tracker import Assignments, Rows, Tracker, join_rows
 
 __all__ = ["track_files"]
@@ -234,9 +235,11 @@ def _track(plots: Plots, sensors: Sensors, config: Config, use_identity: bool, b
     sources = range(len(plots.sources))
     noise = {s: replace(default_noise(plots.sources[s]), **sensors.configured[s]) for s in sources}
 
-    def run(part: Plots, label: str) -> tuple[list[Rows], Measurements, Assignments, dict[int, NoiseEstimate]]:
-        m = place_plots(part, plane, sensors.sites, noise, config.tracker.height_prior)
-        tracker = Tracker(config.tracker, config.filter, sensors.periods, use_identity=use_identity)
+    def run(
+        part: Plots, label: str, settings: TrackerSettings
+    ) -> tuple[list[Rows], Measurements, Assignments, dict[int, NoiseEstimate]]:
+        m = place_plots(part, plane, sensors.sites, noise, settings.height_prior)
+        tracker = Tracker(settings, config.filter, sensors.periods, use_identity=use_identity)
         rows: list[Rows] = []
         found = tracker.run(m, rows.append, lambda share: bar.working(label, share))
         kept = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)
@@ -244,14 +247,15 @@ def _track(plots: Plots, sensors: Sensors, config: Config, use_identity: bool, b
 
     if any(not _configured(plots, s, sensors.configured[s]) for s in sources):
         stretch = _first_stretch(plots)
-        *_, estimates = run(stretch, "estimating noise")
+        well = replace(config.tracker, degraded_noise=1.0)  # larger errors are the noise sought, no condition
+        *_, estimates = run(stretch, "estimating noise", well)
         for s in sources:
             estimated = apply_estimate(noise[s], estimates[s], plots.sources[s])
             noise[s] = replace(estimated, **sensors.configured[s])
-        rows, m, *_ = run(stretch, "checking noise")
+        rows, m, *_ = run(stretch, "checking noise", well)
         for s in sources:
             noise[s] = replace(widened(noise[s], _steady_d2(rows, m, s)), **sensors.configured[s])
-    rows, m, found, estimates = run(plots, "tracking")
+    rows, m, found, estimates = run(plots, "tracking", config.tracker)
     return Tracked(rows, m, found, plane, noise, estimates)
 
 

@@ -162,3 +162,57 @@ def test_no_rows_at_all(sizes):
 def test_impossible_bank(n, sizes):
     with pytest.raises(ModelError, match="a Bank needs n >= 1 and chains of at least one state"):
         Bank(n, sizes)
+
+
+@quick
+@given(rngs(), st.lists(st.integers(1, 3), max_size=2), st.integers(1, 4), st.integers(1, 3))
+def test_a_mixture_of_noises_is_a_chain_drawn_afresh(rng, sizes, h, n_rows):
+    """Against the batch filter with one chain more, whose rows are equal: its axis is summed over, and never stored."""
+    sizes, n = tuple(sizes), 3
+    p = random_problem(rng, sizes, n=n, m=2, n_steps=4, batch=(n_rows,))
+    law = rng.dirichlet(np.ones(h))
+    noises = np.stack([at(p, "R", k) * np.ones((n_rows, *(1 for _ in sizes), 1, 1)) for k in range(4)], axis=1)
+    factor = rng.uniform(0.3, 5.0, h)
+    wide = {
+        name: None if p[name] is None else np.stack([at(p, name, k) for k in range(4)], axis=1)[..., None, :, :]
+        for name in ("F", "Q", "H")
+    }
+    wide |= {
+        name: None if p[name] is None else np.stack([at(p, name, k) for k in range(4)], 1)[..., None, :]
+        for name in "bd"
+    }
+    trans = [
+        np.stack(
+            [np.broadcast_to(np.eye(s), (1, s, s))[0] if (t := transitions(p, k)[c]) is None else t for k in range(4)],
+            axis=-3,
+        )
+        for c, s in enumerate(sizes)
+    ]
+    lift = (n_rows, *sizes, 1)
+    est = imm_filter(
+        p["z"],
+        **wide,
+        R=noises[..., None, :, :] * factor[:, None, None],
+        trans=[*trans, np.tile(law, (h, 1))],
+        mean0=np.broadcast_to(p["mean0"], (*lift[:-1], n))[..., None, :],
+        cov0=np.broadcast_to(p["cov0"], (*lift[:-1], n, n))[..., None, :, :],
+        probs0=np.broadcast_to(p["probs0"], lift[:-1])[..., None] * law,
+    )
+    bank = Bank(n, sizes, capacity=2)
+    rows = rng.permutation(bank.add(start(p, n_rows)))
+    bank.write(rows, start(p, n_rows))
+    for k in range(4):
+        bank.step(rows, transitions(p, k), at(p, "F", k), at(p, "b", k), at(p, "Q", k))
+        R = noises[:, k][:, None] * factor.reshape(-1, *(1 for _ in sizes), 1, 1)
+        H, d = (None if (a := at(p, name, k)) is None else np.broadcast_to(a, (n_rows, *a.shape[1:])) for name in "Hd")
+        each = bank.score_each(rows, p["z"][:, k], H, d, R)
+        weights = np.broadcast_to(np.log(law), (n_rows, h))
+        log_f, posterior = bank.update_mixture(rows, p["z"][:, k], H, d, R, weights)
+        mean, cov, probs = bank.moments(rows)
+        assert error(mean, est.mean[:, k]) < ROUND_OFF
+        assert error(cov, est.cov[:, k]) < ROUND_OFF
+        assert error(probs, est.probs[:, k].sum(-1)) < ROUND_OFF
+        np.testing.assert_allclose(log_f, est.log_likelihood[:, k], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(posterior, weights + each - log_f[:, None], rtol=1e-9, atol=1e-9)
+        joint = est.probs[:, k].reshape(n_rows, -1, h).sum(1)
+        np.testing.assert_allclose(np.exp(posterior), joint, rtol=1e-8, atol=1e-10)

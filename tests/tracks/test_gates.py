@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 from tracking_scenes import measured
 
+from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate
 from saltus.tracks.kinematics import Start, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, TENTATIVE, Birth, Lifecycle
@@ -48,10 +49,13 @@ def later(rng, mean, accel, sigma, accel_v=1.0):
     return z, z[:, 2] + 10.0 * rng.standard_normal(len(mean))
 
 
-def gated(filters, mean, m, *, probability, identity=True, **kwargs):
+def gated(filters, mean, m, *, probability, identity=True, prior=None, **kwargs):
     kinematics, life, rows = tracks(filters, mean, **kwargs)
-    gate = Gate(TrackerSettings(gate_probability=probability), filters, use_identity=identity)
-    found = gate(kinematics, life, m, np.arange(len(m)))
+    settings = TrackerSettings(gate_probability=probability)
+    gate = Gate(settings, filters, use_identity=identity)
+    source = SourceCondition(plot_law(settings, polar=bool(np.isfinite(m.ray).all())), settings)
+    prior = source.predicted(0.0) if prior is None else np.log(prior)
+    found = gate(kinematics, life, m, np.arange(len(m)), source, prior)
     row_of = np.full(rows.max() + 1, -1)
     row_of[rows] = np.arange(len(rows))
     return found, row_of[found.pairs.track]
@@ -126,7 +130,7 @@ def test_pairs_are_those_of_a_loop_over_all(rng, identity):
             if nu @ np.linalg.inv(S) @ nu <= chi2.ppf(0.99, 2) and not apart:
                 expected.add((i, j))
     assert len(expected) > 40
-    right = found.fault == 0
+    right = np.array([pair in expected for pair in zip(track.tolist(), found.pairs.plot.tolist(), strict=True)])
     assert set(zip(track[right].tolist(), found.pairs.plot[right].tolist(), strict=True)) == expected
     # Tracks not confirmed yet take a faulty plot only where the address vouches for it.
     assert identity or right.all()
@@ -162,7 +166,7 @@ def test_a_faulty_plot_is_explained_for_confirmed_tracks_only(shift, kind):
     mean[0, 0], mean[0, 4] = 60e3, 8e3
     m = polar(measured([DT], [[60e3 + shift[0], shift[1]]], 25.0), np.zeros(2))
     found, _ = gated(AGILE, mean, m, probability=0.9999, status=CONFIRMED)
-    assert found.fault.tolist() == [kind]
+    assert found.pairs.plot.tolist() == [0]
     # An azimuth error moves the plot across its ray by the range times the error, a range error along it.
     x, y = 60e3 + shift[0], shift[1]
     settings = TrackerSettings()
@@ -170,7 +174,8 @@ def test_a_faulty_plot_is_explained_for_confirmed_tracks_only(shift, kind):
         moved = np.radians(settings.outlier_azimuth) * np.array([-y, x])
     else:
         moved = settings.outlier_range / np.hypot(x, y) * np.array([x, y])
-    np.testing.assert_allclose(found.plan.cov[0, :2, :2], 25.0**2 * np.eye(2) + np.outer(moved, moved), rtol=1e-9)
+    np.testing.assert_allclose(found.plan.cov[0, :2, :2], 25.0**2 * np.eye(2), rtol=1e-12)
+    np.testing.assert_allclose(found.covs[0, kind, :2, :2], 25.0**2 * np.eye(2) + np.outer(moved, moved), rtol=1e-9)
     tentative, _ = gated(AGILE, mean, m, probability=0.9999, status=TENTATIVE)
     assert len(tentative.pairs.plot) == 0
 
@@ -181,3 +186,14 @@ def test_a_plot_far_beyond_any_fault_is_nobodys():
     m = polar(measured([DT], [[60e3, 9000.0]], 25.0), np.zeros(2))
     found, _ = gated(AGILE, mean, m, probability=0.9999, status=CONFIRMED)
     assert len(found.pairs.plot) == 0
+
+
+@pytest.mark.parametrize(("prior", "share"), [((0.999, 0.001), 0.0), ((0.9, 0.1), 1.0)])
+def test_gates_widen_when_the_source_is_probably_degraded(prior, share):
+    """Plots 4.9 deviations off: outside the gate of a source that is well, inside that of one five times worse."""
+    mean = far_apart(20)
+    plots = mean[:, :3:2] + DT * mean[:, 1:4:2]
+    P = 900.0 + 2 * DT * 60.0 + DT**2 * 25.0 + 100.0**2 + (DT**2 / 2 * 2.0) ** 2
+    m = measured(np.full(20, DT), plots + np.array([4.9 * np.sqrt(P), 0.0]), 100.0)
+    found, _ = gated(STEADY, mean, m, probability=0.9999, prior=np.array(prior))
+    assert len(found.pairs.plot) == 20 * share

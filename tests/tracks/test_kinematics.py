@@ -61,7 +61,8 @@ def carried(settings, tracks):
     for k, dt in enumerate(STEPS):
         copies = kinematics.predicted(rows[::-1], np.full(3, dt))
         plan = Plan(position[::-1, k], cov[::-1, k], np.zeros(3))
-        total[::-1, k] = copies.update(np.arange(3), plan)
+        total[::-1, k] = copies.score(np.arange(3), plan, plan.cov[:, None])[:, 0]
+        copies.update(np.arange(3), plan)
         kinematics.put(rows[::-1], copies, np.arange(3))
         out.append(kinematics.moments(rows))
     return out, total

@@ -12,7 +12,9 @@ from jaxtyping import Float, Int
 from saltus.errors import ModelError
 from saltus.filters import steps
 from saltus.filters.backend import MOST_MODES, MOST_STATES, Backend, use_native
+from saltus.filters.memoryless import merge
 from saltus.filters.steps import Belief
+from saltus.linalg import logsumexp
 
 __all__ = ["Bank", "NumpyStore"]
 
@@ -106,6 +108,57 @@ class Bank:
             NumericalError: an innovation covariance is not positive definite; what the rows hold is then undefined.
         """
         return self._store.measure(rows, z, H, d, R, write=True)
+
+    def score_each(self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array) -> Float[np.ndarray, "k h"]:
+        """Return log f(z) of measurement z[i] for row rows[i] (repeats allowed) under h noise covariances.
+
+        Args:
+            rows: k rows.
+            z: (k, m).
+            H: (k, M1|1, ..., m, n).
+            d: (k, M1|1, ..., m) or None.
+            R: (k, h, M1|1, ..., m, m).
+        """
+        h, each = R.shape[1], np.repeat(np.arange(len(rows)), R.shape[1])
+        offset = None if d is None else d[each]
+        _, log_f = self.score(rows[each], z[each], H[each], offset, R.reshape((-1, *R.shape[2:])))
+        return log_f.reshape(-1, h)
+
+    def update_mixture(
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, log_weights: _Array
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k h"]]:
+        """Condition row rows[i] on z[i], whose noise has covariance R[i, a] with probability w[i, a] (no row twice).
+
+        Every pair of mode and covariance is conditioned by itself, weighs P_j w_a f_ja(z), and the axis of the
+        covariances is merged by moments (`memoryless.merge`): the product with a chain that is drawn afresh at every
+        measurement, exact as long as mixing is, at no stored mode.
+
+        Args:
+            rows: k rows.
+            z: (k, m).
+            H: (k, M1|1, ..., m, n).
+            d: (k, M1|1, ..., m) or None.
+            R: (k, h, M1|1, ..., m, m).
+            log_weights: log w, each row's sum of w being 1, (k, h).
+
+        Returns:
+            log f(z), and the logarithms of the posterior probabilities of the covariances.
+
+        Source: theory notes on fusion, sections 4 and 5, with a memoryless chain of h states on the measurement.
+        """
+        k, h = log_weights.shape
+        each, every = np.repeat(np.arange(k), h), np.arange(k * h)
+        offset = None if d is None else d[each]
+        copies = self.take(rows[each])
+        _, log_f = copies.update(every, z[each], H[each], offset, R.reshape((-1, *R.shape[2:])))
+        log_joint = log_weights + log_f.reshape(k, h)
+        total = logsumexp(log_joint, (1,))
+        log_posterior = log_joint - total
+        split = Belief(*(a.reshape(k, h, *a.shape[1:]) for a in copies.read(every)))
+        log_probs = split.log_probs + log_posterior.reshape(k, h, *(1 for _ in self.sizes))
+        merged = merge(Belief(log_probs, split.means, split.covs), 0, 1 + len(self.sizes))
+        self.write(rows, Belief(*(a[:, 0] for a in merged)))
+        return total[:, 0], log_posterior
 
     def moments(
         self, rows: _Rows

@@ -158,16 +158,22 @@ def _blocks(block: FloatArray, dims: int) -> FloatArray:
     """Block-diagonal matrices (..., dims rows, dims cols) from blocks (..., dims|1, rows, cols)."""
     rows, cols = block.shape[-2:]
     lead = block.shape[:-3]
+    if dims == 1:
+        return block[..., 0, :, :]
     result = np.zeros((*lead, dims, rows, dims, cols))
-    axis = np.arange(dims)
-    result[..., axis, :, axis, :] = np.moveaxis(np.broadcast_to(block, (*lead, dims, rows, cols)), -3, 0)
+    for axis in range(dims):
+        result[..., axis, :, axis, :] = block[..., axis % block.shape[-3], :, :]
     return result.reshape(*lead, dims * rows, dims * cols)
 
 
 def _matrix(rows: Sequence[Sequence[FloatArray | float]]) -> FloatArray:
     """Stack entries that broadcast against each other into matrices (..., rows, cols)."""
-    flat = np.broadcast_arrays(*(np.asarray(entry, dtype=np.float64) for row in rows for entry in row))
-    return np.stack(flat, axis=-1).reshape(*flat[0].shape, len(rows), len(rows[0]))
+    shape = np.broadcast_shapes(*(np.shape(entry) for row in rows for entry in row))
+    result = np.empty((*shape, len(rows), len(rows[0])))
+    for i, row in enumerate(rows):
+        for j, entry in enumerate(row):
+            result[..., i, j] = entry
+    return result
 
 
 def _velocity_scan(dt: FloatArray, accel: FloatArray, _: FloatArray) -> tuple[FloatArray, FloatArray]:

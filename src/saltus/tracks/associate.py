@@ -13,6 +13,9 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
 
+_AT_ONCE = 4096  # pairs up to which all distances cost less than a tree
+
+
 class Pairs(NamedTuple):
     """Candidate pairs: positions in the lists of tracks and plots they were made from."""
 
@@ -28,11 +31,11 @@ def near_pairs(tracks: _Array, reach: _Array, plots: _Array) -> Pairs:
         reach: radius about each, (K,), m.
         plots: plane positions, (N, 2), m.
     """
+    if len(tracks) * len(plots) <= _AT_ONCE:  # a tree costs more than all distances
+        apart = np.hypot(tracks[:, None, 0] - plots[:, 0], tracks[:, None, 1] - plots[:, 1])
+        return Pairs(*np.nonzero(apart <= reach[:, None]))
     from scipy.spatial import cKDTree
 
-    if not len(tracks) or not len(plots):
-        empty = np.zeros(0, np.intp)
-        return Pairs(empty, empty)
     found = cKDTree(plots).query_ball_point(tracks, reach)
     counts = np.array([len(f) for f in found])
     return Pairs(np.repeat(np.arange(len(tracks)), counts), np.concatenate([np.asarray(f, np.intp) for f in found]))
@@ -50,8 +53,9 @@ def equal_codes(tracks: npt.NDArray[np.integer], plots: npt.NDArray[np.integer])
 
 def join_pairs(a: Pairs, b: Pairs) -> Pairs:
     """Return the pairs of both, each once."""
-    both = np.unique(np.stack([np.concatenate([a.track, b.track]), np.concatenate([a.plot, b.plot])]), axis=1)
-    return Pairs(both[0], both[1])
+    track, plot = np.concatenate([a.track, b.track]), np.concatenate([a.plot, b.plot])
+    width = 1 + int(plot.max(initial=0))
+    return Pairs(*np.divmod(np.unique(track * width + plot), width))
 
 
 def assign(pairs: Pairs, gain: _Array) -> _Index:

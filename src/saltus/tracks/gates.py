@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.tracks.associate import Pairs, equal_codes, join_pairs, near_pairs
+from saltus.tracks.faults import SourceCondition
 from saltus.tracks.identity import conflicting
 from saltus.tracks.kinematics import Kinematics, Plan
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
@@ -27,11 +28,11 @@ class Gated(NamedTuple):
 
     pairs: Pairs  # rows of the bank, positions in the slice
     plan: Plan  # the measurement of each pair, its height removed where it fell outside
+    covs: _Array  # (P, h, 3, 3): its covariance under every hypothesis of its source
     centre: _Array  # (P, 2), predicted measurement
     gate_cov: _Array  # (P, 2, 2), innovation covariance of the most agile mode: the gate
     d2: _Array  # (P,), horizontal squared Mahalanobis distance to the mixture's prediction
     height_used: npt.NDArray[np.bool_]  # (P,)
-    fault: npt.NDArray[np.int8]  # (P,): 0 none, 1 azimuth, 2 range
     copies: Kinematics
     copy: _Index  # (P,): row of each pair among the copies
 
@@ -48,84 +49,118 @@ class Gate:
         self.horizontal = _chi2_quantile(settings.gate_probability, 2)
         self.height = _chi2_quantile(settings.gate_probability, 1)
         self.fault = _chi2_quantile(_FAULT_GATE, 2)
-        self._outlier_azimuth = float(np.radians(settings.outlier_azimuth))
-        self._outlier_range, self._outlier_xy = settings.outlier_range, settings.outlier_xy
+        self._growth = settings.degraded_noise**2
         self._accel, self._accel_time = max(filters.accel_h), filters.accel_time
         self._use_identity = use_identity
 
-    def __call__(self, kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Index) -> Gated:
-        """Pair tracks with the plots `index` of a slice inside their gates."""
-        rows = life.rows()
-        near = self._coarse(life, rows, m, index)
-        near = self._close(Pairs(rows[near.track], near.plot), life, m, index)
-        if self._use_identity:
-            same = equal_codes(life.icao24[rows], m.icao24[index])
-            near = join_pairs(near, Pairs(rows[same.track], same.plot))
-        near = self._admissible(near, life, m, index)
-        dt = m.time[index[near.plot]] - life.time[near.track]
+    def __call__(
+        self,
+        kinematics: Kinematics,
+        life: Lifecycle,
+        m: Measurements,
+        index: _Index,
+        source: SourceCondition,
+        prior: _Array,
+    ) -> Gated:
+        """Pair tracks with the plots `index` of a slice inside their gates.
+
+        Args:
+            kinematics: the filters of all tracks.
+            life: their lifecycle.
+            m: all measurements.
+            index: plots of one source in one slice.
+            source: the condition of that source, and what may be wrong with its plots.
+            prior: log probabilities of the conditions.
+        """
+        near = self._near(life, m, index, source, prior)
+        plot = index[near.plot]
+        dt = m.time[plot] - life.time[near.track]
         offset = np.minimum(dt, 0.0)  # a plot of another source may come a little late
         copies = kinematics.predicted(near.track, np.maximum(dt, 0.0))
         every = np.arange(len(dt))
-        z, R = m.position[index[near.plot]], m.cov[index[near.plot]]
+        z, R = m.position[plot], m.cov[plot]
         y, S = _measured(*copies.widest(every), offset, R)
         d2_gate, d2_height = _distances(z - y, S)
-        in_gate = d2_gate <= self.horizontal
         trusted = (life.status[near.track] == CONFIRMED) | self._same_address(near, life, m, index)
-        R, fault = self._faults(~in_gate & trusted, z - y, S, R, m, index[near.plot])
-        inside = np.flatnonzero(in_gate | (fault > 0))
-        mixture = copies.moments(every)
-        y_mixture, S_mixture = _measured(mixture.mean, mixture.cov, offset, R)
+        faulty = self._faulty(d2_gate, trusted, z - y, S - R, m, plot, source, prior)
+        inside = np.flatnonzero((d2_gate <= self.horizontal) | faulty)
+        mixture = copies.moments(inside)
+        y_mixture, S_mixture = _measured(mixture.mean, mixture.cov, offset[inside], R[inside])
+        z, plot = z[inside], plot[inside]
         d2, _ = _distances(z - y_mixture, S_mixture)
-        height_used = np.isfinite(z[:, 2]) & (d2_height <= self.height)
-        z = z.copy()
+        height_used = np.isfinite(z[:, 2]) & (d2_height[inside] <= self.height)
         z[~height_used, 2] = np.nan
+        covs = source.law.covariances(m, plot) * m.inflation[plot, None, None, None]
         return Gated(
             Pairs(near.track[inside], near.plot[inside]),
-            Plan(z[inside], R[inside] * m.inflation[index[near.plot[inside]], None, None], offset[inside]),
+            Plan(z, covs[:, 0], offset[inside]),
+            covs,
             y[inside, :2],
             S[inside, :2, :2],
-            d2[inside],
-            height_used[inside],
-            fault[inside],
+            d2,
+            height_used,
             copies,
             inside,
         )
 
-    def _faults(
-        self, candidate: npt.NDArray[np.bool_], nu: _Array, S: _Array, R: _Array, m: Measurements, plot: _Index
-    ) -> tuple[_Array, npt.NDArray[np.int8]]:
-        """Explain plots outside the gate of a confirmed track by a faulty azimuth or range where that fits."""
-        fault = np.zeros(len(nu), np.int8)
-        at = np.flatnonzero(candidate)
-        wide = m.faulty(plot[at], self._outlier_azimuth, self._outlier_range, self._outlier_xy)
-        S_fault = (S[at] - R[at])[:, None] + wide
-        d2 = np.stack([_distances(nu[at], S_fault[:, k])[0] for k in (0, 1)], axis=-1)
-        log_f = -0.5 * (d2 + np.log(np.linalg.det(S_fault[..., :2, :2])))
-        best = log_f.argmax(-1)
-        row = np.arange(len(at))
-        fits = d2[row, best] <= self.fault
-        fault[at[fits]] = 1 + best[fits]
-        R = R.copy()
-        R[at[fits]] = wide[row, best][fits]
-        return R, fault
+    def _near(self, life: Lifecycle, m: Measurements, index: _Index, source: SourceCondition, prior: _Array) -> Pairs:
+        """Pair what cheap bounds allow."""
+        rows, live = life.rows(), source.live(prior)
+        bounds = _Bounds(
+            self._growth if source.law.condition[live].any() else 1.0,
+            source.law.outlier if source.law.fault.any() else np.zeros(1),
+        )
+        near = self._coarse(life, rows, m, index, bounds)
+        near = self._close(Pairs(rows[near.track], near.plot), life, m, index, bounds)
+        if self._use_identity:
+            same = equal_codes(life.icao24[rows], m.icao24[index])
+            near = join_pairs(near, Pairs(rows[same.track], same.plot))
+        return self._admissible(near, life, m, index)
 
-    def _coarse(self, life: Lifecycle, rows: _Index, m: Measurements, index: _Index) -> Pairs:
+    def _faulty(
+        self,
+        d2: _Array,
+        trusted: npt.NDArray[np.bool_],
+        nu: _Array,
+        S: _Array,
+        m: Measurements,
+        plot: _Index,
+        source: SourceCondition,
+        prior: _Array,
+    ) -> npt.NDArray[np.bool_]:
+        """Say which pairs outside the plain gate lie inside that of a fault, or of a condition to be reckoned with.
+
+        A fault of the plot's own is for confirmed tracks, and those of its address.
+        """
+        live, out = source.live(prior), np.zeros(len(d2), bool)
+        lasting = source.law.condition[live].any()
+        at = np.flatnonzero((d2 > self.horizontal) & (trusted | lasting))
+        if len(live) == 1 or not len(at):
+            return out
+        wide = S[at][:, None] + source.law.covariances(m, plot[at], live)
+        k, h = wide.shape[:2]
+        d2_wide = _distances(np.repeat(nu[at], h, axis=0), wide.reshape(-1, 3, 3))[0].reshape(k, h)
+        own = source.law.fault[live] > 0
+        out[at] = ((d2_wide <= np.where(own, self.fault, self.horizontal)) & (trusted[at, None] | ~own)).any(axis=1)
+        return out
+
+    def _coarse(self, life: Lifecycle, rows: _Index, m: Measurements, index: _Index, bounds: "_Bounds") -> Pairs:
         """Pair by a radius about the position in mid-slice that no plot inside a gate can exceed."""
         middle, half = _span(m.time[index])
         dt = np.maximum(middle - life.time[rows], 0.0)
         velocity = life.mean[rows][:, _VELOCITY[:2]]
         position = life.mean[rows][:, _POSITION[:2]] + dt[:, None] * velocity
-        reach = self._reach(life, rows, dt + half, float(self._spread(m, index).max()))
-        reach = reach + np.where(life.status[rows] == CONFIRMED, float(self._astray(m, index).max()), 0.0)
+        reach = self._reach(life, rows, dt + half, float(bounds.spread(m, index).max()))
+        reach = reach + np.where(life.status[rows] == CONFIRMED, float(self._astray(m, index, bounds).max()), 0.0)
         return near_pairs(position, reach + np.hypot(velocity[:, 0], velocity[:, 1]) * half, m.position[index, :2])
 
-    def _close(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> Pairs:
+    def _close(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index, bounds: "_Bounds") -> Pairs:
         """Keep the pairs that the same radius allows at the plot's own time."""
         track, plot = pairs.track, index[pairs.plot]
         dt = m.time[plot] - life.time[track]
         position = life.mean[track][:, _POSITION[:2]] + dt[:, None] * life.mean[track][:, _VELOCITY[:2]]
-        reach = self._reach(life, track, np.abs(dt), self._spread(m, plot))
-        reach = reach + np.where(life.status[track] == CONFIRMED, self._astray(m, plot), 0.0)
+        reach = self._reach(life, track, np.abs(dt), bounds.spread(m, plot))
+        reach = reach + np.where(life.status[track] == CONFIRMED, self._astray(m, plot, bounds), 0.0)
         keep = np.linalg.norm(m.position[plot, :2] - position, axis=-1) <= reach
         return Pairs(track[keep], pairs.plot[keep])
 
@@ -137,14 +172,8 @@ class Gate:
         variance += self._accel**2 * dt**3 * (0.5 * dt + 2.0 / 3.0 * self._accel_time)
         return np.asarray(np.sqrt(self.horizontal * (variance + plot_variance)))
 
-    def _spread(self, m: Measurements, plot: _Index) -> _Array:
-        return np.asarray(m.cov[plot, 0, 0] + m.cov[plot, 1, 1])
-
-    def _astray(self, m: Measurements, plot: _Index) -> _Array:
-        """How far a faulty plot may lie."""
-        far = np.hypot(m.ray[plot, 0], m.ray[plot, 1])
-        wrong = np.hypot(self._outlier_range, self._outlier_azimuth * far)
-        return np.asarray(np.sqrt(self.fault) * np.where(np.isnan(far), 1.5 * self._outlier_xy, wrong))
+    def _astray(self, m: Measurements, plot: _Index, bounds: "_Bounds") -> _Array:
+        return np.asarray(np.sqrt(self.fault) * bounds.astray(m, plot))
 
     def _admissible(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> Pairs:
         """Drop pairs of contradicting addresses, and plots too old for the track."""
@@ -159,6 +188,22 @@ class Gate:
     def _same_address(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> npt.NDArray[np.bool_]:
         known = life.icao24[pairs.track] >= 0
         return np.asarray(self._use_identity & known & (life.icao24[pairs.track] == m.icao24[index[pairs.plot]]))
+
+
+class _Bounds(NamedTuple):
+    """What the plots of a source may be at the worst."""
+
+    growth: float  # of the variance, in the conditions to be reckoned with
+    outlier: _Array  # deviations of faults, rad and m
+
+    def spread(self, m: Measurements, plot: _Index) -> _Array:
+        return np.asarray(self.growth * (m.cov[plot, 0, 0] + m.cov[plot, 1, 1]))
+
+    def astray(self, m: Measurements, plot: _Index) -> _Array:
+        """Deviation of a faulty plot."""
+        if len(self.outlier) == 1:
+            return np.full(len(plot), np.sqrt(2.0) * self.outlier[0])
+        return np.asarray(np.hypot(self.outlier[1], self.outlier[0] * np.hypot(m.ray[plot, 0], m.ray[plot, 1])))
 
 
 def _chi2_quantile(probability: float, dof: int) -> float:
@@ -189,4 +234,5 @@ def _distances(nu: _Array, S: _Array) -> tuple[_Array, _Array]:
     det = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
     a, b = nu[:, 0], nu[:, 1]
     d2 = (S[:, 1, 1] * a * a - 2.0 * S[:, 0, 1] * a * b + S[:, 0, 0] * b * b) / det
-    return d2, np.nan_to_num(nu[:, 2] ** 2 / S[:, 2, 2], nan=np.inf)
+    height = nu[:, 2] ** 2 / S[:, 2, 2]
+    return d2, np.where(np.isnan(height), np.inf, height)

@@ -6,6 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from saltus.errors import NumericalError
 from saltus.filters import Bank, Belief
 from saltus.models import Chain, Motion, constant_velocity
 from saltus.tracks.settings import FilterSettings
@@ -82,17 +83,33 @@ class Channel:
         ahead.step(np.arange(len(rows)), trans, F, None, Q)
         return replace(self, bank=ahead)
 
-    def update(self, rows: _Rows, plan: Plan) -> tuple[_Array, _Array]:
-        """Condition rows on the measured axes; return d2 and log-likelihood."""
-        m, ones = len(self.axes), tuple(1 for _ in self.bank.sizes)
-        H = np.zeros((len(rows), m, 2 * m))
-        H[:, np.arange(m), 2 * np.arange(m)] = 1.0
-        H[:, np.arange(m), 2 * np.arange(m) + 1] = plan.offset[:, None]
-        R = plan.cov[:, self.axes[:, None], self.axes]
-        lift = (len(rows), *ones)
-        return self.bank.update(
-            rows, plan.position[:, self.axes], H.reshape((*lift, m, 2 * m)), None, R.reshape((*lift, m, m))
-        )
+    def update(self, rows: _Rows, plan: Plan) -> None:
+        """Condition rows on the measured axes."""
+        z, H = self._measured(plan)
+        self.bank.update(rows, z, H, None, self._noise(plan.cov))
+
+    def update_mixture(self, rows: _Rows, plan: Plan, covs: _Array, log_weights: _Array) -> None:
+        """Condition rows on measurements whose covariances `covs` (k, h, 3, 3) have probabilities w (k, h)."""
+        z, H = self._measured(plan)
+        self.bank.update_mixture(rows, z, H, None, self._noise(covs), log_weights)
+
+    def score(self, rows: _Rows, plan: Plan, covs: _Array) -> _Array:
+        """Log-likelihood of the measured axes under h covariances (k, h, 3, 3) of each measurement, (k, h)."""
+        z, H = self._measured(plan)
+        return self.bank.score_each(rows, z, H, None, self._noise(covs))
+
+    def _measured(self, plan: Plan) -> tuple[_Array, _Array]:
+        """The measured axes, and the matrix that takes them from the state."""
+        m, each = len(self.axes), np.arange(len(self.axes))
+        H = np.zeros((len(plan.offset), m, 2 * m))
+        H[:, each, 2 * each] = 1.0
+        H[:, each, 2 * each + 1] = plan.offset[:, None]
+        return plan.position[:, self.axes], H.reshape((len(H), *(1 for _ in self.bank.sizes), m, 2 * m))
+
+    def _noise(self, cov: _Array) -> _Array:
+        """Covariances (..., 3, 3) of the measured axes, with an axis for each chain."""
+        R = cov[..., self.axes[:, None], self.axes]
+        return R.reshape((*R.shape[:-2], *(1 for _ in self.bank.sizes), *R.shape[-2:]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,8 +125,8 @@ class Kinematics:
     def add(self, start: Start) -> _Rows:
         """Store new rows."""
         first, *others = [channel.bank.add(channel.belief(start)) for channel in self.channels]
-        for rows in others:
-            np.testing.assert_array_equal(rows, first)  # banks used alike recycle rows alike
+        if any((rows != first).any() for rows in others):
+            raise NumericalError("internal: banks used alike gave rows of different numbers")
         return first
 
     def write(self, rows: _Rows, start: Start) -> None:
@@ -126,9 +143,30 @@ class Kinematics:
         """Copies of rows (repeats allowed), numbered from 0, moved forward by dt >= 0."""
         return Kinematics(tuple(channel.predicted(rows, dt) for channel in self.channels))
 
-    def update(self, rows: _Rows, plan: Plan) -> _Array:
-        """Condition rows on measurements; return their log-likelihood."""
-        return np.asarray(sum(channel.update(rows, plan)[1] for channel in self.channels))
+    def update(self, rows: _Rows, plan: Plan) -> None:
+        """Condition rows on measurements."""
+        for channel in self.channels:
+            channel.update(rows, plan)
+
+    def update_mixture(self, rows: _Rows, plan: Plan, covs: _Array, log_weights: _Array) -> None:
+        """Condition rows on measurements whose covariance in the plane has h candidates.
+
+        Args:
+            rows: k rows, none twice.
+            plan: the measurements; its covariances serve where the plane is not measured.
+            covs: (k, h, 3, 3).
+            log_weights: logarithms of their probabilities, (k, h).
+        """
+        for channel in self.channels:
+            if 0 in channel.axes:
+                channel.update_mixture(rows, plan, covs, log_weights)
+            else:
+                channel.update(rows, plan)
+
+    def score(self, rows: _Rows, plan: Plan, covs: _Array) -> _Array:
+        """Return log-likelihoods of measurements under each of h covariances in the plane, (k, h); repeats allowed."""
+        parts = [channel.score(rows, plan, covs if 0 in channel.axes else covs[:, :1]) for channel in self.channels]
+        return np.asarray(sum(parts))
 
     def widest(self, rows: _Rows) -> tuple[_Array, _Array]:
         """Mean and covariance of the most agile mode of every channel: what a gate must not cut off."""

@@ -45,6 +45,7 @@ class Lifecycle:
         self.period = np.zeros(0)  # shortest update period of the sources that saw the track, s
         self.history = np.zeros(0, np.uint64)  # bit k: a plot k expected scans ago
         self.coasted = np.zeros(0, np.int64)  # coasted rows published since the last update
+        self.p_fault = np.zeros(0)  # probability that the last plot was faulty, NaN where nothing told
         self.has_altitude = np.zeros(0, bool)
         self.icao24 = np.zeros(0, np.int32)
         self.mode3a = np.zeros(0, np.int16)
@@ -67,6 +68,7 @@ class Lifecycle:
         self.located[rows] = birth.time
         self.history[rows] = 1
         self.coasted[rows] = 0
+        self.p_fault[rows] = np.nan
         self.has_altitude[rows] = False
         self.icao24[rows] = self.mode3a[rows] = self.named[rows] = NO_CODE
 
@@ -110,6 +112,8 @@ class Lifecycle:
         """Return the rows, past their first plot, whose address an older or surer row has: one aircraft, one track."""
         rows = self.rows()
         rows = rows[(self.status[rows] != SEED) & (self.icao24[rows] >= 0)]
+        if len(set(self.icao24[rows].tolist())) == len(rows):
+            return np.zeros(0, np.intp)
         rows = rows[np.lexsort((self.id[rows], -self.status[rows]))]
         _, first = np.unique(self.icao24[rows], return_index=True)
         return np.delete(rows, first)
@@ -117,8 +121,8 @@ class Lifecycle:
     def holds(self, icao24: npt.NDArray[np.int32]) -> npt.NDArray[np.bool_]:
         """Say which addresses a row past its first plot has already."""
         rows = self.rows()
-        taken = self.icao24[rows[self.status[rows] != SEED]]
-        return (icao24 >= 0) & np.isin(icao24, taken)
+        taken = set(self.icao24[rows[self.status[rows] != SEED]].tolist())
+        return np.array([code >= 0 and code in taken for code in icao24.tolist()], bool)
 
     def to_coast(self, now: float) -> tuple[_Rows, _Array]:
         """Count and return confirmed rows that missed one more plot by `now`, and the time it was expected."""

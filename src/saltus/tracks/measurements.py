@@ -31,7 +31,6 @@ _Array = npt.NDArray[np.float64]
 # Where nothing is configured and nothing could be estimated: a monopulse secondary radar, an airport
 # multilateration, ADS-B with good satellite navigation, heights in steps of 100 ft.
 _RANGE, _AZIMUTH, _ELEVATION, _XY, _ALTITUDE = 50.0, np.radians(0.08), np.radians(0.3), 20.0, 10.0
-_FAULTY_SHARE = 0.03  # of the range: faults scale with what a radar covers
 _SURFACE, _GROUND_RELIEF = 10, 20.0  # ASTERIX category of surface movement; m
 _SMALLEST_AREA = 1e6  # m^2
 _SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
@@ -108,25 +107,6 @@ class Measurements:
         unknown = np.isnan(position[:, 2])
         position[unknown, 2], cov[unknown, 2, 2] = prior[0], prior[1] ** 2
         return position, cov
-
-    def faulty(self, index: npt.NDArray[np.intp], sigma_azimuth: float, sigma_range: float, sigma_xy: float) -> _Array:
-        """Return covariances (k, 2, 3, 3) of plots with a faulty azimuth, and with a faulty range.
-
-        R + sigma_azimuth^2 c c' and R + sigma_range^2 u u', u the unit vector from the site and c the vector of the
-        same length as the ground range across it; sigma_range is cut to 3 % of the range. Where the source is not
-        polar, its position is faulty: R + sigma_xy^2 I, twice.
-        """
-        ray = self.ray[index]
-        polar = np.isfinite(ray[:, 0])
-        away = np.where(polar[:, None], ray, (1.0, 0.0))
-        across = np.stack([-away[:, 1], away[:, 0]], axis=-1) * sigma_azimuth
-        distance = np.linalg.norm(away, axis=-1, keepdims=True)
-        along = away / distance * np.minimum(sigma_range, _FAULTY_SHARE * distance)
-        shift = np.stack([across, along], axis=1)
-        spread = shift[..., :, None] * shift[..., None, :]
-        cov = np.repeat(self.cov[index][:, None], 2, axis=1)
-        cov[..., :2, :2] += np.where(polar[:, None, None, None], spread, sigma_xy**2 * np.eye(2))
-        return cov
 
     def split_from(
         self, left: npt.NDArray[np.intp], used: npt.NDArray[np.intp], max_range: float, max_azimuth: float

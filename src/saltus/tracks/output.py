@@ -68,6 +68,7 @@ def track_table(rows: Rows, plane: Plane, plots: Plots, m: Measurements, sigma_p
             "cov_vnvn": velocity[:, 1, 1],
             "p_manoeuvre_h": np.clip(rows.moments.p_manoeuvre_h, 0.0, 1.0),
             "p_manoeuvre_v": np.clip(rows.moments.p_manoeuvre_v, 0.0, 1.0),
+            "p_fault": _null_nan(rows.p_fault),
             "status": pa.array(np.array(STATUS)[rows.status], pa.string()),
             "icao24": pa.array([f"{c:06X}" if c >= 0 else None for c in rows.icao24], pa.string()),
             "mode3a": pa.array([f"{c:04o}" if c >= 0 else None for c in rows.mode3a], pa.string()),

@@ -77,12 +77,15 @@ class TrackerSettings:
             source and scan that updated a confirmed track, with no other height or identity, is a split plot.
         split_azimuth: see split_range.
         altitude_outlier: probability that a plot's height is wrong (garbled Mode C); such a height is ignored.
-        plot_outlier: probability that a radar plot's azimuth, or its range, is faulty, or the position of another
-            sensor; a plot outside the gate of a confirmed track, or of one of its own address, may still be taken
-            for such a fault, with the deviations below.
+        plot_outlier: probability that a radar plot's azimuth is faulty, and its range, or the position of another
+            sensor, each plot by itself; 0 = none is. A plot outside the gate of a confirmed track, or of one of its
+            own address, may still be taken for such a fault, with the deviations below.
         outlier_azimuth: standard deviation of a faulty azimuth, degrees.
         outlier_range: standard deviation of a faulty range, m, but no more than 3 % of the range.
         outlier_xy: standard deviation of a faulty position, each axis, m.
+        degraded_noise: factor of the standard deviations of a degraded source: of azimuth or range or both, or of
+            position; 1 = no source degrades.
+        degraded_sojourn: mean time that a source is well, and degraded, s.
         height_prior: mean and standard deviation of the height of targets that do not tell it, m; what a surface
             movement sensor (CAT010) sees is taken to stand on the ground.
         sigma_pressure: error of pressure altitude as geometric height, m; widens the published covariance near
@@ -105,15 +108,21 @@ class TrackerSettings:
     outlier_azimuth: float = 1.5
     outlier_range: float = 400.0
     outlier_xy: float = 200.0
+    degraded_noise: float = 5.0
+    degraded_sojourn: tuple[float, float] = (7200.0, 60.0)
     height_prior: tuple[float, float] = (5000.0, 3500.0)
     sigma_pressure: float = 100.0
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""
-        for name in ("gate_probability", "detection_probability", "altitude_outlier", "plot_outlier"):
+        for name in ("gate_probability", "detection_probability", "altitude_outlier"):
             value = getattr(self, name)
             if not 0.0 < value < 1.0:
                 raise ModelError(f"tracker.{name} is a probability between 0 and 1, got {value}.")
+        if not 0.0 <= self.plot_outlier < 0.5:
+            raise ModelError(f"tracker.plot_outlier is a probability below 0.5, 0 for no faults: {self.plot_outlier}.")
+        if not 1.0 <= self.degraded_noise < np.inf:
+            raise ModelError(f"tracker.degraded_noise is a factor, 1 or greater: {self.degraded_noise}.")
         if not 1 <= self.confirm_hits <= self.confirm_scans <= 32:
             raise ModelError(
                 f"tracker.confirm_hits of confirm_scans (M of N) needs 1 <= M <= N <= 32, "
@@ -123,6 +132,7 @@ class TrackerSettings:
         outliers = ("split_azimuth", "outlier_azimuth", "outlier_range", "outlier_xy", "sigma_pressure")
         given = {name: getattr(self, name) for name in (*positive, *outliers)}
         given["height_prior[1]"] = self.height_prior[1]
+        given |= {f"degraded_sojourn[{k}]": stay for k, stay in enumerate(self.degraded_sojourn)}
         if self.clutter_density is not None:
             given["clutter_density"] = self.clutter_density
         for name, value in given.items():

@@ -1,32 +1,32 @@
 """The tracker's loop: slices of a scan in time order, all tracks of a slice as arrays."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
+from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
-from saltus.tracks.kinematics import Moments, Start, make_kinematics, two_point_start, with_speed_prior
+from saltus.tracks.kinematics import Moments, Plan, Start, make_kinematics, two_point_start, with_speed_prior
 from saltus.tracks.lifecycle import COASTED, CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.sights import sight
+from saltus.tracks.slices import rounds, slices
 
 __all__ = ["Assignments", "Rows", "Tracker", "join_rows"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
-# A target gives a source at most one plot in a slice of this share of the shortest update period: a rotating radar
-# keeps its period, other systems report more often now and then.
-_SLICE_ROTATING, _SLICE_OTHER = 0.9, 0.4
-_LONGEST_SLICE = 4.0  # s
 _UNEXPLAINED = 0.1  # of a source's plots are clutter or new targets
 _HEIGHT_SPAN = 15_000.0  # m: heights of clutter and new targets spread over this
 _CLIMB = 15.0  # m/s: standard deviation of the vertical speed of a new track
+_NEGLIGIBLE = 1e-3  # probability of all other hypotheses of a plot that is taken for right
 _STANDING = np.array([-4.0, -2.0, 0.0])  # nats: a plot is less likely a seed's or a tentative track's own
 
 
@@ -45,6 +45,8 @@ class Rows(NamedTuple):
     centre: _Array  # (k, 2): centre of the gate
     gate_cov: _Array  # (k, 2, 2): innovation covariance
     d2: _Array  # squared Mahalanobis distance of the horizontal innovation; NaN where there is none
+    p_fault: _Array  # probability that the track's last plot was faulty; NaN where nothing told
+    fault: npt.NDArray[np.int8]  # likeliest fault of the measurement: 1 + component of its source's; 0 without one
 
 
 def join_rows(parts: Sequence[Rows]) -> Rows:
@@ -62,6 +64,8 @@ def join_rows(parts: Sequence[Rows]) -> Rows:
         np.zeros((0, 2)),
         np.zeros((0, 2, 2)),
         np.zeros(0),
+        np.zeros(0),
+        np.zeros(0, np.int8),
     )
     parts = [nothing, *parts]
     moments = Moments(*(np.concatenate(column) for column in zip(*(p.moments for p in parts), strict=True)))
@@ -76,6 +80,7 @@ class Assignments(NamedTuple):
     split: npt.NDArray[np.bool_]  # (N,): a second plot of a target already updated
     elsewhere: npt.NDArray[np.bool_]  # (N,): far from the track that has its address
     confirmed: npt.NDArray[np.int64]  # ids of the tracks that were confirmed at some time
+    sources: Sequence[SourceCondition]  # what was found of the condition of each source
 
 
 class Tracker:
@@ -127,34 +132,31 @@ class Tracker:
         self._split = np.zeros(len(measurements), bool)
         self._elsewhere = np.zeros(len(measurements), bool)
         self._density = self._densities(measurements)
-        for begin, end in self._slices():
+        self._sources = [self._condition(s) for s in range(len(self._periods))]
+        for begin, end in slices(measurements, self._periods):
             self._housekeep(float(measurements.time[begin]))
             sources = measurements.source[begin:end]
             _, first = np.unique(sources, return_index=True)
             for s in sources[np.sort(first)]:  # as they come, whatever number each has
-                self._scan(begin + np.flatnonzero(sources == s), float(self._periods[s]))
+                own, period = begin + np.flatnonzero(sources == s), float(self._periods[s])
+                speed = self._settings.max_speed
+                for scan in rounds(measurements, own, period, speed, use_identity=self._use_identity):
+                    self._scan(scan, period)
             if progress is not None:
                 progress(end / len(measurements))
         confirmed = np.concatenate([np.zeros(0, np.int64), *self._confirmed])
-        return Assignments(self._track_id, self._split, self._elsewhere, np.unique(confirmed))
+        return Assignments(self._track_id, self._split, self._elsewhere, np.unique(confirmed), self._sources)
+
+    def _condition(self, source: int) -> SourceCondition:
+        own = (self._m.source == source) & np.isfinite(self._m.position[:, 0])
+        law = plot_law(self._settings, polar=bool(own.any() and np.isfinite(self._m.ray[own, 0]).all()))
+        return SourceCondition(law, self._settings)
 
     def _densities(self, m: Measurements) -> _Array:
         """Clutter and new targets per m^2 and scan, of each source."""
         if self._settings.clutter_density is not None:
             return np.full(len(self._periods), self._settings.clutter_density)
         return _UNEXPLAINED * np.array([m.density(s, float(p)) for s, p in enumerate(self._periods)])
-
-    def _slices(self) -> Iterator[tuple[int, int]]:
-        time = self._m.time
-        used, first = np.unique(self._m.source, return_index=True)
-        rotating = np.isfinite(self._m.ray[first, 0])
-        share = _SLICE_ROTATING if len(used) == 1 and rotating.all() else _SLICE_OTHER
-        width = min(_LONGEST_SLICE, share * float(self._periods[used].min())) if len(used) else 1.0
-        begin = 0
-        while begin < len(time):
-            end = int(np.searchsorted(time, time[begin] + width, side="right"))
-            yield begin, end
-            begin = end
 
     def _housekeep(self, now: float) -> None:
         """Publish what coasts; drop what is overdue or moves as no target does."""
@@ -164,8 +166,9 @@ class Tracker:
             rows, expected = self._life.to_coast(now)
         life = self._life
         ended = np.unique(np.concatenate([life.overdue(now), life.too_fast(), life.repeated()]))
-        self._kinematics.remove(ended)
-        life.end(ended)
+        if len(ended):
+            self._kinematics.remove(ended)
+            life.end(ended)
 
     def _scan(self, index: _Index, period: float) -> None:
         """Associate and absorb the plots of one source in one slice."""
@@ -176,19 +179,45 @@ class Tracker:
             index = index[~bearings]
             if not len(index):
                 return
-        gated = self._gate(self._kinematics, life, self._m, index)
-        log_f = gated.copies.update(gated.copy, gated.plan)
-        chosen = assign(gated.pairs, self._gain(gated, index, log_f))
+        m, time = self._m, float(self._m.time[index[-1]])
+        source = self._sources[m.source[index[0]]]
+        prior = source.predicted(time)
+        gated = self._gate(self._kinematics, life, m, index, source, prior)
+        log_f = gated.copies.score(gated.copy, gated.plan, gated.covs)
+        chosen = assign(gated.pairs, self._gain(gated, index, logsumexp(source.weights(prior) + log_f, (1,))[:, 0]))
         rows, plots = gated.pairs.track[chosen], index[gated.pairs.plot[chosen]]
         seed = life.status[rows] == SEED
         self._start(rows[seed], plots[seed])
-        self._kinematics.put(rows[~seed], gated.copies, gated.copy[chosen[~seed]])
+        weights = source.absorb(time, prior, log_f[chosen], life.status[rows] == CONFIRMED)
+        p = _normalised(weights + log_f[chosen])
+        self._update(rows[~seed], gated, chosen[~seed], weights[~seed], p[~seed])
         self._enter(rows, plots, period, gated.height_used[chosen])
+        wrong, fault = source.law.faulty(p)
+        life.p_fault[rows] = np.where(seed, np.nan, wrong)
         # Neither a start nor a fault says whether the filter's innovations are what it thinks.
-        d2 = np.where(seed | (gated.fault[chosen] > 0), np.nan, gated.d2[chosen])
-        self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2)
-        left = np.setdiff1d(np.arange(len(index)), gated.pairs.plot[chosen])
+        d2 = np.where(seed | (p @ (source.law.condition + source.law.fault > 0) > 0.5), np.nan, gated.d2[chosen])
+        self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2, np.where(seed, 0, fault))
+        left = np.ones(len(index), bool)
+        left[gated.pairs.plot[chosen]] = False
         self._begin(index[left], plots[life.status[rows] == CONFIRMED], period)
+
+    def _update(self, rows: _Index, gated: Gated, pairs: _Index, log_weights: _Array, p: _Array) -> None:
+        """Condition tracks on the plots chosen, each a mixture of what may be wrong with it.
+
+        A plot that is right but for a probability of 1e-3 moves its track as a right one: the other hypotheses would
+        move it by less than that share of its distance.
+        """
+        mixed = p[:, 0] < 1.0 - _NEGLIGIBLE
+        for which, several in ((~mixed, False), (mixed, True)):
+            at = pairs[which]
+            if not len(at):
+                continue
+            plan = Plan(*(column[at] for column in gated.plan))
+            if several:
+                gated.copies.update_mixture(gated.copy[at], plan, gated.covs[at], log_weights[which])
+            else:
+                gated.copies.update(gated.copy[at], plan)
+        self._kinematics.put(rows, gated.copies, gated.copy[pairs])
 
     def _sight(self, index: _Index) -> None:
         """Absorb the bearings of one source in one slice: they update confirmed tracks, and do nothing else."""
@@ -202,7 +231,8 @@ class Tracker:
         self._kinematics.put(rows, seen.copies, seen.copy[chosen])
         life.sighted(rows, m.time[plots])
         self._track_id[plots] = life.id[rows]
-        self._publish(rows, plots, seen.centre[chosen], seen.cov[chosen], np.full(len(rows), np.nan))
+        nothing = np.full(len(rows), np.nan)
+        self._publish(rows, plots, seen.centre[chosen], seen.cov[chosen], nothing, np.zeros(len(rows), np.int8))
 
     def _gain(self, gated: Gated, index: _Index, log_f: _Array) -> _Array:
         """Log-likelihood ratio of "this plot is this track's" against "the track missed and the plot is new"."""
@@ -213,7 +243,6 @@ class Tracker:
         has_height = np.isfinite(m.position[plot, 2])
         gain = gain + np.where(gated.height_used, np.log((1.0 - settings.altitude_outlier) * _HEIGHT_SPAN), 0.0)
         gain = gain + np.where(has_height & ~gated.height_used, np.log(settings.altitude_outlier), 0.0)
-        gain = gain + np.where(gated.fault > 0, np.log(settings.plot_outlier), 0.0)
         gain = gain + _STANDING[life.status[track]]
         if self._use_identity:
             gain = gain + identity_gain(life.icao24[track], m.icao24[plot], life.mode3a[track], m.mode3a[plot])
@@ -222,6 +251,8 @@ class Tracker:
     def _start(self, rows: _Index, plots: _Index) -> None:
         """Begin the filters of tracks that found their second plot."""
         m, life, prior = self._m, self._life, self._settings.height_prior
+        if not len(rows):
+            return
         first, dt = life.plot[rows], m.time[plots] - life.time[rows]
         start = two_point_start(*m.with_height(first, prior), *m.with_height(plots, prior), dt)
         start = with_speed_prior(start, self._settings.max_speed)
@@ -248,6 +279,8 @@ class Tracker:
     def _begin(self, plots: _Index, used: _Index, period: float) -> None:
         """Mark plots left over that are split or contradict their address; begin a track with every other one."""
         m, life, settings = self._m, self._life, self._settings
+        if not len(plots):
+            return
         split = m.split_from(plots, used, settings.split_range, np.radians(settings.split_azimuth))
         elsewhere = life.holds(m.icao24[plots]) & self._use_identity & ~split
         self._split[plots[split]], self._elsewhere[plots[elsewhere]] = True, True
@@ -269,7 +302,9 @@ class Tracker:
             life.mode3a[rows] = np.where(m.mode3a[plots] >= 0, m.mode3a[plots], life.mode3a[rows])
             life.named[rows] = np.where(m.named[plots], plots, life.named[rows])
 
-    def _publish(self, rows: _Index, plots: _Index, centre: _Array, gate_cov: _Array, d2: _Array) -> None:
+    def _publish(
+        self, rows: _Index, plots: _Index, centre: _Array, gate_cov: _Array, d2: _Array, fault: npt.NDArray[np.int8]
+    ) -> None:
         if len(rows):
             life, moments = self._life, self._kinematics.moments(rows)
             life.mean[rows], life.cov[rows] = moments.mean, moments.cov
@@ -286,6 +321,8 @@ class Tracker:
                     centre,
                     gate_cov,
                     d2,
+                    life.p_fault[rows],
+                    fault.astype(np.int8),
                 )
             )
 
@@ -307,5 +344,11 @@ class Tracker:
                 moments.mean[:, [0, 2]],
                 moments.cov[:, [[0], [2]], [0, 2]],
                 np.full(len(rows), np.nan),
+                life.p_fault[rows],
+                np.zeros(len(rows), np.int8),
             )
         )
+
+
+def _normalised(log_p: _Array) -> _Array:
+    return np.asarray(np.exp(log_p - logsumexp(log_p, (1,))))

@@ -1,0 +1,180 @@
+"""What may be wrong with a plot: a fault of its own, without memory, and the lasting condition of its source.
+
+A plot of a radar is right, or wrong in azimuth, or in range; that of another sensor is right, or wrong as a position.
+The source is well, or degraded in the same components, all its plots alike. Every pair of the two is a covariance of
+the measurement, and a plot is the mixture of them: the product of two more chains with the manoeuvres of each track.
+The plot's chain forgets; the source's is one for all tracks and lives here, so no track stores a mode for either.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.linalg import logsumexp
+from saltus.tracks.measurements import Measurements
+from saltus.tracks.settings import TrackerSettings
+
+__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law"]
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.intp]
+
+_FAULTY_SHARE = 0.03  # of the range: faults scale with what a radar covers
+_LIVE = 0.01  # probability of a condition from which gates reckon with it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlotLaw:
+    """The h covariances that a plot of one source may have; the first is a good plot's of a source that is well."""
+
+    components: tuple[str, ...]  # what may go wrong: azimuth and range, or the position
+    degraded: npt.NDArray[np.bool_]  # (q, components): what each condition of the source degrades; the first nothing
+    condition: _Index  # (h,)
+    fault: npt.NDArray[np.int8]  # (h,): 0 none, else 1 + the component
+    log_fault: _Array  # (h,): logarithm of the probability of the plot's own state
+    growth: float  # of the variance, in a degraded component
+    outlier: _Array  # (components,): standard deviation of a fault, rad and m
+
+    def covariances(self, m: Measurements, index: _Index, which: _Index | None = None) -> _Array:
+        """Return covariances of plots under the hypotheses `which` (all by default), (k, h, 3, 3).
+
+        R + sum_a e_a B_a over the components a: e_a = (growth - 1) v_a where the source is degraded in a, plus
+        outlier_a^2 where the plot is wrong in it. Of a radar B = c c', u u' with u the unit vector from the site and c
+        the one across it, v = c'R c, u'R u; a fault of azimuth counts times the ground range, one of range is cut to
+        3 % of it. Else B = I and v the mean of the two variances.
+        """
+        h = np.arange(len(self.fault)) if which is None else which
+        R = m.cov[index]
+        basis, variance, wrong = self._basis(m, index, R[:, :2, :2])
+        lasting = (self.growth - 1.0) * self.degraded[self.condition[h]]
+        own = self.fault[h, None] == 1 + np.arange(len(self.components))
+        extra = lasting * variance[:, None] + own * wrong[:, None] ** 2
+        cov = np.repeat(R[:, None], len(h), axis=1)
+        cov[..., :2, :2] += np.einsum("kha,kaij->khij", extra, basis)
+        return cov
+
+    def faulty(self, p: _Array) -> tuple[_Array, npt.NDArray[np.int8]]:
+        """Return the probability that each plot is wrong, and its likeliest fault (1 + component), 0 if none can be.
+
+        Args:
+            p: probabilities of the hypotheses, (n, h).
+        """
+        if not self.fault.any():
+            return np.zeros(len(p)), np.zeros(len(p), np.int8)
+        each = p @ (self.fault[:, None] == 1 + np.arange(len(self.components)))
+        return np.minimum(each.sum(axis=1), 1.0), (1 + each.argmax(axis=1)).astype(np.int8)
+
+    def _basis(self, m: Measurements, index: _Index, R: _Array) -> tuple[_Array, _Array, _Array]:
+        """Directions B (k, a, 2, 2), variances in them (k, a), deviations of faults (k, a)."""
+        if len(self.components) == 1:
+            each = np.ones((len(index), 1))
+            return each[..., None, None] * np.eye(2), 0.5 * np.trace(R, axis1=1, axis2=2)[:, None], each * self.outlier
+        ray = m.ray[index]
+        distance = np.hypot(ray[:, 0], ray[:, 1])
+        u = ray / distance[:, None]
+        direction = np.stack([np.stack([-u[:, 1], u[:, 0]], axis=-1), u], axis=1)
+        variance = np.einsum("kai,kij,kaj->ka", direction, R, direction)
+        wrong = np.stack([self.outlier[0] * distance, np.minimum(self.outlier[1], _FAULTY_SHARE * distance)], axis=-1)
+        return direction[..., :, None] * direction[..., None, :], variance, wrong
+
+
+def plot_law(settings: TrackerSettings, *, polar: bool) -> PlotLaw:
+    """Return what the settings say of the plots of a source, whether it measures range and azimuth or not."""
+    components = ("azimuth", "range") if polar else ("position",)
+    conditions = list(product((False, True), repeat=len(components)))
+    faults, p = range(1 + len(components)), settings.plot_outlier
+    if settings.degraded_noise == 1.0:
+        conditions = conditions[:1]
+    if p == 0.0:
+        faults = range(1)
+    pairs = np.array(list(product(range(len(conditions)), faults)))
+    prior = np.array([1.0 - p * (len(faults) - 1), *([p] * (len(faults) - 1))])
+    outlier = [np.radians(settings.outlier_azimuth), settings.outlier_range] if polar else [settings.outlier_xy]
+    return PlotLaw(
+        components,
+        np.array(conditions),
+        pairs[:, 0],
+        pairs[:, 1].astype(np.int8),
+        np.log(prior)[pairs[:, 1]],
+        settings.degraded_noise**2,
+        np.array(outlier),
+    )
+
+
+class History(NamedTuple):
+    """The condition of a source after each scan that told something of it."""
+
+    time: _Array  # (T,), s
+    probs: _Array  # (T, q)
+
+
+class SourceCondition:
+    """The condition of one source: a forward filter over its scans, fed by all its tracks at once.
+
+    Its components degrade independently, each a chain of two states with the given mean stays. One scan multiplies the
+    predicted probability of a condition by the likelihoods of all plots under it.
+    """
+
+    def __init__(self, law: PlotLaw, settings: TrackerSettings) -> None:
+        """Begin with the stationary probabilities."""
+        self.law = law
+        self._sojourn = settings.degraded_sojourn
+        self._share = self._sojourn[1] / sum(self._sojourn)  # of the time that a component is degraded
+        each = np.where(law.degraded, self._share, 1.0 - self._share)
+        self._log_probs = np.log(each.prod(axis=1)) if len(law.degraded) > 1 else np.zeros(1)
+        self._time = -np.inf
+        self._history: list[tuple[float, _Array]] = []
+
+    @property
+    def history(self) -> History:
+        """What has been found so far."""
+        times = np.array([time for time, _ in self._history])
+        return History(times, np.array([p for _, p in self._history]).reshape(-1, len(self.law.degraded)))
+
+    def predicted(self, time: float) -> _Array:
+        """Return log probabilities of the conditions at a time, (q,)."""
+        if len(self._log_probs) == 1 or not np.isfinite(self._time):
+            return self._log_probs
+        rate = 1.0 / self._sojourn[0] + 1.0 / self._sojourn[1]
+        fade = float(np.exp(-rate * max(time - self._time, 0.0)))
+        law = np.array([1.0 - self._share, self._share])
+        trans = fade * np.eye(2) + (1.0 - fade) * law
+        probs = np.exp(self._log_probs).reshape((2,) * len(self.law.components))
+        for axis in range(probs.ndim):
+            probs = np.moveaxis(np.tensordot(probs, trans, (axis, 0)), -1, axis)
+        return np.asarray(np.log(np.maximum(probs, 1e-300)).ravel())
+
+    def live(self, prior: _Array) -> _Index:
+        """Return the hypotheses that a gate must reckon with, given log probabilities of the conditions."""
+        return np.flatnonzero(np.exp(prior)[self.law.condition] > _LIVE)
+
+    def weights(self, prior: _Array) -> _Array:
+        """Return log probabilities of all hypotheses, (h,), from those of the conditions."""
+        return np.asarray(prior[self.law.condition] + self.law.log_fault)
+
+    def absorb(self, time: float, prior: _Array, log_f: _Array, known: npt.NDArray[np.bool_]) -> _Array:
+        """Take in a scan; return for every plot the log probabilities of its hypotheses before it was seen itself.
+
+        P(q | scan) ~ P(q) prod_i f_i(q), f_i(q) = sum_h P(h) f_i(h); for plot i its own factor is left out, and
+        comes back when its track is conditioned on it.
+
+        Args:
+            time: of the scan, s.
+            prior: log probabilities of the conditions, (q,).
+            log_f: log-likelihood of each plot under each hypothesis, (n, h).
+            known: whether a plot is a confirmed track's, (n,); others say nothing of the source.
+        """
+        q, law = len(prior), self.law
+        of_condition = (law.log_fault + log_f).reshape(len(log_f), q, len(law.fault) // q)
+        by_condition = logsumexp(of_condition, (2,))[..., 0]
+        told = np.where(known[:, None], by_condition, 0.0)
+        total = prior + told.sum(axis=0)
+        if known.any() and q > 1:
+            self._log_probs = total - logsumexp(total, (0,))
+            self._time = time
+            self._history.append((time, np.exp(self._log_probs)))
+        others = total - told
+        return np.asarray((others - logsumexp(others, (1,)))[:, law.condition] + law.log_fault)

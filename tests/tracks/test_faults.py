@@ -1,0 +1,237 @@
+"""Plots that may be faulty and sources that may be degraded: covariances, the filter over scans, and the tracker."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from tracking_scenes import SITE, measured, observed, polar_noise, run
+
+from saltus.errors import ModelError
+from saltus.geo import Plane
+from saltus.simulate import Leg, Radar, Trajectory, observe
+from saltus.tracks.faults import SourceCondition, plot_law
+from saltus.tracks.settings import TrackerSettings
+
+DT = 4.0
+SETTINGS = TrackerSettings(plot_outlier=0.01, degraded_noise=4.0, degraded_sojourn=(300.0, 50.0))
+OFF = replace(SETTINGS, plot_outlier=0.0, degraded_noise=1.0)
+
+
+def polar_plots(rng, n, sigma_range, sigma_azimuth):
+    """Plots round a radar with independent errors of range and azimuth."""
+    distance, azimuth = rng.uniform(20e3, 80e3, n), rng.uniform(0.0, 2 * np.pi, n)
+    u = np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
+    m = measured(np.arange(float(n)), u * distance[:, None] + [5e3, -7e3], 1.0)
+    turned = np.stack([np.stack([u[:, 1], -u[:, 0]], axis=-1), u], axis=-1)  # columns: across, along
+    return replace(m, ray=u * distance[:, None]), turned, distance, sigma_azimuth * distance, sigma_range
+
+
+def test_a_fault_widens_what_it_makes_wrong(rng):
+    m, turned, distance, across, along = polar_plots(rng, 7, 30.0, 0.002)
+
+    def plane(variance_across, variance_along):
+        D = np.zeros((7, 2, 2))
+        D[:, 0, 0], D[:, 1, 1] = variance_across, variance_along
+        return turned @ D @ turned.swapaxes(1, 2)
+
+    cov = m.cov.copy()
+    cov[:, :2, :2] = plane(across**2, along**2)
+    law = plot_law(SETTINGS, polar=True)
+    found = law.covariances(replace(m, cov=cov), np.arange(7))
+    wrong = (
+        (np.radians(SETTINGS.outlier_azimuth) * distance) ** 2,
+        np.minimum(SETTINGS.outlier_range, 0.03 * distance) ** 2,
+    )
+    for h, (condition, fault) in enumerate(zip(law.condition, law.fault, strict=True)):
+        worse = np.where(law.degraded[condition], 16.0, 1.0)
+        expected = plane(
+            across**2 * worse[0] + (wrong[0] if fault == 1 else 0.0),
+            along**2 * worse[1] + (wrong[1] if fault == 2 else 0.0),
+        )
+        np.testing.assert_allclose(found[:, h, :2, :2], expected, rtol=1e-9, atol=1e-6)
+        np.testing.assert_array_equal(found[:, h, 2], cov[:, 2])
+    assert len(set(zip(law.condition.tolist(), law.fault.tolist(), strict=True))) == 12
+    np.testing.assert_allclose(np.exp(law.log_fault[:3]), [0.98, 0.01, 0.01])
+
+
+def test_positions_are_wrong_as_a_whole():
+    m = measured([0.0], [[1e3, 2e3]], 30.0)
+    law = plot_law(SETTINGS, polar=False)
+    found = law.covariances(m, np.arange(1))[0, :, :2, :2]
+    variances = [900.0, 900.0 + 200.0**2, 16 * 900.0, 16 * 900.0 + 200.0**2]
+    np.testing.assert_allclose(found, np.array(variances)[:, None, None] * np.eye(2), rtol=1e-12)
+
+
+@pytest.mark.parametrize("polar", [True, False])
+def test_the_condition_is_that_of_all_sequences(rng, polar):
+    """Three scans of two confirmed tracks and a tentative one: every sequence of conditions and faults, enumerated."""
+    law = plot_law(SETTINGS, polar=polar)
+    source, times = SourceCondition(law, SETTINGS), [0.0, 7.0, 11.0]
+    log_f = rng.normal(-10.0, 3.0, (3, 3, len(law.fault)))
+    known = np.array([True, True, False])
+    rate = 1.0 / np.array(SETTINGS.degraded_sojourn)
+    generator = np.array([[-rate[0], rate[0]], [rate[1], -rate[1]]])
+    share = rate[0] / rate.sum()
+
+    def chain(dt):
+        T = expm(generator * dt)
+        return np.kron(T, T) if polar else T
+
+    first = np.where(law.degraded, share, 1 - share).prod(axis=1)
+    trans = [chain(7.0), chain(4.0)]
+    q = len(first)
+    of = [
+        np.array([[np.exp(log_f[k, i] + law.log_fault)[law.condition == c].sum() for c in range(q)] for i in range(3)])
+        for k in range(3)
+    ]
+    for k in range(3):
+        weight = np.zeros((q, 3, len(law.fault)))  # joint law of the last condition and each plot's hypothesis
+        posterior = np.zeros(q)
+        for path in product(range(q), repeat=k + 1):
+            p = first[path[0]] * np.prod([trans[s][path[s], path[s + 1]] for s in range(k)])
+            for s in range(k):
+                p *= of[s][:2, path[s]].prod()
+            posterior[path[-1]] += p * of[k][:2, path[-1]].prod()
+            for i in range(3):
+                others = np.prod([of[k][j, path[-1]] for j in (0, 1) if j != i])
+                own = np.exp(log_f[k, i] + law.log_fault) * (law.condition == path[-1])
+                weight[path[-1], i] += p * others * own
+        prior = source.predicted(times[k])
+        weights = source.absorb(times[k], prior, log_f[k], known)
+        np.testing.assert_allclose(source.history.probs[k], posterior / posterior.sum(), rtol=1e-9)
+        found = np.exp(weights + log_f[k])
+        expected = weight.sum(axis=0)
+        np.testing.assert_allclose(
+            found / found.sum(axis=1, keepdims=True), expected / expected.sum(axis=1, keepdims=True), rtol=1e-9
+        )
+
+
+def test_tentative_tracks_say_nothing_of_a_source(rng):
+    source = SourceCondition(plot_law(SETTINGS, polar=True), SETTINGS)
+    prior = source.predicted(0.0)
+    source.absorb(0.0, prior, rng.normal(size=(4, 12)) * 50.0, np.zeros(4, bool))
+    assert len(source.history.time) == 0
+    np.testing.assert_array_equal(source.predicted(100.0), prior)
+
+
+def radar(**kwargs):
+    settings = dict(period=DT, sigma_range=20.0, sigma_azimuth=float(np.radians(0.03)), sigma_altitude=5.0)
+    return Radar(SITE, **{**settings, "prob_detection": 1.0, **kwargs})
+
+
+def flown(rng, seconds=240.0):
+    """Ten aircraft round a radar, three of them turning; plots and whose they are."""
+    turn = (Leg(70.0), Leg(60.0, turn_rate=0.03), Leg(seconds))
+    way = [
+        Trajectory(
+            (40e3 * np.cos(a), 40e3 * np.sin(a), 7e3 + 300.0 * k), a + 1.5, 200.0, turn if k < 3 else (Leg(300.0),)
+        )
+        for k, a in enumerate(np.arange(10) * 0.628)
+    ]
+    seen = observe(radar(), way, Plane(SITE.latitude, SITE.longitude), 0.0, seconds, rng)
+    return observed([seen], [radar()], [polar_noise(radar())], Plane(SITE.latitude, SITE.longitude))
+
+
+def moved(m, which, azimuth=0.0, along=0.0):
+    """Turn plots about the radar by an angle, and push them along their rays."""
+    position, ray = m.position.copy(), m.ray[which]
+    across = np.stack([ray[:, 1], -ray[:, 0]], axis=-1)
+    u = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    position[which, :2] += across * np.reshape(azimuth, (-1, 1)) + u * np.reshape(along, (-1, 1))
+    return replace(m, position=position)
+
+
+def judged(found, m):
+    """p_fault and fault of each plot that updated a track; NaN elsewhere."""
+    p, fault = np.full(len(m), np.nan), np.zeros(len(m), int)
+    rows = found.all_rows
+    at = rows.measurement >= 0
+    p[rows.measurement[at]], fault[rows.measurement[at]] = rows.p_fault[at], rows.fault[at]
+    return p, fault
+
+
+def test_faulty_plots_are_told_and_good_ones_not(rng):
+    m, label = flown(rng)
+    late = np.flatnonzero((m.time > 30.0) & (label >= 0))
+    wrong = rng.choice(late, 24, replace=False)
+    signs = rng.choice([-1.0, 1.0], 12)
+    faulty = moved(moved(m, wrong[:12], azimuth=np.radians(signs)), wrong[12:], along=700.0 * signs)
+    found = run(faulty)
+    p, fault = judged(found, m)
+    assert (p[wrong] > 0.5).mean() >= 0.9
+    assert (fault[wrong[:12]][p[wrong[:12]] > 0.5] == 1).all()
+    assert (fault[wrong[12:]][p[wrong[12:]] > 0.5] == 2).all()
+    good = np.setdiff1d(late, wrong)
+    assert np.isfinite(p[good]).all()
+    assert (p[good] > 0.5).mean() <= 0.005  # turning ones among them
+    assert (p[late] >= 0.0).all() and (p[late] <= 1.0).all()
+    # A start tells nothing of its plots; what coasts keeps what was found of the last plot.
+    first = [np.flatnonzero(label == k)[:2] for k in range(10)]
+    assert np.isnan(p[np.concatenate(first)]).all()
+    # The same without faults in the model: the plots break tracks or bend them.
+    blind, _ = judged(run(faulty, settings=OFF), m)
+    assert np.nanmax(blind) == 0.0
+
+
+def test_a_coasted_row_tells_of_the_last_plot(rng):
+    m, label = flown(rng, seconds=160.0)
+    of_five = np.flatnonzero(label == 5)
+    last = of_five[20]
+    m = moved(m, [last], azimuth=np.radians(1.2)).take(np.flatnonzero((label != 5) | (m.time <= m.time[last])))
+    rows = run(m).all_rows
+    track = rows.track_id[rows.measurement == np.flatnonzero(m.time == m.time[last])[0]][0]
+    mine = rows.track_id == track
+    coasted = mine & (rows.status == 3)
+    assert coasted.sum() >= 3
+    p_last = rows.p_fault[mine & (rows.measurement >= 0)][-1]
+    assert p_last > 0.9
+    np.testing.assert_array_equal(rows.p_fault[coasted], p_last)
+
+
+@pytest.mark.parametrize(("component", "name"), [(0, "azimuth"), (1, "range")])
+def test_a_degraded_radar_is_told_from_turns_and_outliers(rng, component, name):
+    """From 100 s to 160 s one component errs six times as much, all tracks alike; it is found, and found to end."""
+    m, label = flown(rng)
+    bad = np.flatnonzero((m.time > 100.0) & (m.time < 160.0))
+    size = 6.0 * rng.standard_normal(len(bad))
+    sick = moved(m, bad, azimuth=size * np.radians(0.03)) if component == 0 else moved(m, bad, along=size * 20.0)
+    found = run(sick)
+    history = found.raw.sources[0].history
+    law = found.raw.sources[0].law
+    degraded = history.probs @ law.degraded
+    during = (history.time > 108.0) & (history.time < 158.0)
+    apart = (history.time < 100.0) | (history.time > 172.0)
+    assert law.components[component] == name
+    assert (degraded[during, component] > 0.9).all()
+    assert (degraded[during, 1 - component] < 0.5).all()
+    assert (degraded[apart] < 0.05).all()
+    # A degraded source is no fault of each plot, nor a manoeuvre of each aircraft.
+    p, _ = judged(found, m)
+    assert (p[bad] > 0.5).mean() < 0.05
+    assert len(np.unique(found.track_id[label >= 0])) == 10
+    rows, off = found.rows, run(sick, settings=OFF).rows
+    straight = (np.isin(rows.measurement, bad[label[bad] >= 3])), np.isin(off.measurement, bad[label[bad] >= 3])
+    p_known, p_off = rows.moments.p_manoeuvre_h[straight[0]].mean(), off.moments.p_manoeuvre_h[straight[1]].mean()
+    assert p_known < 0.3 < p_off
+
+
+def test_a_radar_that_is_well_stays_so(rng):
+    m, _ = flown(rng)
+    found = run(m)
+    history = found.raw.sources[0].history
+    assert history.time.shape == (len(history.probs),)
+    assert history.probs[:, 0].min() > 0.99
+
+
+def test_impossible_settings_of_faults_are_refused():
+    for wrong in (
+        dict(plot_outlier=0.5),
+        dict(plot_outlier=-0.1),
+        dict(degraded_noise=0.5),
+        dict(degraded_noise=np.inf),
+        dict(degraded_sojourn=(0.0, 10.0)),
+    ):
+        with pytest.raises(ModelError, match=next(iter(wrong))):
+            TrackerSettings(**wrong)
