@@ -8,13 +8,14 @@ import numpy.typing as npt
 
 from saltus.filters.imm import imm_filter
 from saltus.identify.local import PairSettings
+from saltus.linalg import block_diagonal
 from saltus.models.checks import FloatArray
 
 __all__ = ["Index", "Lanes", "Start", "batches", "flatten", "joint_log_likelihood", "own_filters", "region_start"]
 
 Index = npt.NDArray[np.int64]
 
-_ELEMENTS = 4_000_000  # numbers in the matrices of one batch: about 32 MB
+_ELEMENTS = 1_000_000  # numbers in the matrices of one batch: 8 MB stay near the processor
 
 
 class Start(NamedTuple):
@@ -82,7 +83,7 @@ def own_filters(
         Log-likelihood of every row (L, T), and probs (W, M), means (W, M, 4), covs (W, M, 4, 4) after the wanted rows.
     """
     start = region_start(settings, lanes.time[:, 0])
-    F, Q, trans = _matrices(lanes.time, start.time, settings)
+    F, Q, trans = _matrices(lanes.time, start.time, settings, 4)
     found = imm_filter(
         lanes.z,
         F=F,
@@ -109,15 +110,11 @@ def joint_log_likelihood(lanes: Lanes, start: Start, settings: PairSettings) -> 
     do = -o / offset_time dt + noise that keeps the covariance.
     """
     offset = np.asarray(settings.offset_cov)
-    F, Q, trans = _matrices(lanes.time, start.time, settings)
+    F, Q, trans = _matrices(lanes.time, start.time, settings, 6 if offset.any() else 4)
     H, mean, cov = _position(4), start.mean, start.cov
     if offset.any():
-        dt = np.diff(lanes.time, axis=1, prepend=start.time[:, None])[..., None, None, None]
-        kept = np.exp(-dt / settings.offset_time)
-        F = _bordered(F, kept * np.eye(2))
-        Q = _bordered(Q, (1.0 - kept**2) * offset)
         mean = np.concatenate([mean, np.zeros((*mean.shape[:-1], 2))], axis=-1)
-        cov = _bordered(cov, offset)
+        cov = block_diagonal(cov, offset)
         H = np.zeros((*lanes.offset.shape, 1, 2, 6))
         H[..., 0, 0] = H[..., 1, 2] = 1.0
         H[..., 0, 4] = H[..., 1, 5] = lanes.offset[..., None]
@@ -137,23 +134,30 @@ def joint_log_likelihood(lanes: Lanes, start: Start, settings: PairSettings) -> 
 
 
 def _matrices(
-    time: FloatArray, before: FloatArray, settings: PairSettings
+    time: FloatArray, before: FloatArray, settings: PairSettings, n: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """F (L, T, 1, 4, 4), Q (L, T, M, 4, 4) and transition matrices (L, T, M, M) over the interval before each row."""
+    """F (L, T, 1, n, n), Q (L, T, M, n, n) and transition matrices (L, T, M, M) over the interval before each row.
+
+    `constant_velocity` of kind "white", filled in place: matrices of this size cost more to copy than to use.
+    """
     dt = np.diff(time, axis=1, prepend=before[:, None])
-    step = settings.motion().step(dt)
-    return step.F, step.Q, settings.chain().transition(dt)
+    chain = settings.chain()
+    t = dt[..., None]
+    F, Q = np.zeros((*t.shape, n, n)), np.zeros((*dt.shape, len(chain), n, n))
+    F[..., range(4), range(4)] = 1.0
+    corner, side, end = (power * settings.densities() for power in (t**3 / 3, t**2 / 2, t))
+    for x, v in ((0, 1), (2, 3)):
+        F[..., x, v] = t
+        Q[..., x, x], Q[..., x, v], Q[..., v, x], Q[..., v, v] = corner, side, side, end
+    if n > 4:
+        kept = np.exp(-t / settings.offset_time)
+        F[..., 4, 4] = F[..., 5, 5] = kept
+        if np.isfinite(settings.offset_time):
+            Q[..., 4:, 4:] = (1.0 - kept**2)[..., None, None] * np.asarray(settings.offset_cov)
+    return F, Q, chain.transition(dt)
 
 
 def _position(n: int) -> FloatArray:
     H = np.zeros((1, 2, n))
     H[0, 0, 0] = H[0, 1, 2] = 1.0
     return H
-
-
-def _bordered(a: FloatArray, corner: FloatArray) -> FloatArray:
-    """Set matrices (..., 4, 4) and (..., 2, 2) along the diagonal."""
-    lead = np.broadcast_shapes(a.shape[:-2], corner.shape[:-2])
-    out = np.zeros((*lead, 6, 6))
-    out[..., :4, :4], out[..., 4:, 4:] = a, corner
-    return out

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from saltus.errors import DataError, ModelError
-from saltus.models import Chain, Motion, constant_velocity
+from saltus.models import Chain
 from saltus.models.checks import FloatArray, covariance, numbers, same
 
 __all__ = ["LocalTracks", "PairSettings", "Spans", "spans"]
@@ -91,16 +91,16 @@ class PairSettings:
         plain = (self.accel, self.sojourn, self.accel_time, self.offset_time, self.speed_sigma)
         return hash((*plain, *(np.asarray(a).tobytes() for a in arrays)))
 
-    def chain(self) -> Chain:
-        """Return the chain of manoeuvres; its states hold the spectral density of acceleration, m^2/s^3."""
-        density = {f"level{i}": a * a * self.accel_time for i, a in enumerate(self.accel)}
-        if len(density) == 1:
-            return Chain("manoeuvre", density, trans=[[1.0]])
-        return Chain("manoeuvre", density, sojourn=dict(zip(density, self.sojourn, strict=True)))
+    def densities(self) -> FloatArray:
+        """Return the spectral density of acceleration in each mode, (M,), m^2/s^3."""
+        return np.square(self.accel) * self.accel_time
 
-    def motion(self) -> Motion:
-        """Return the motion in the plane, with one mode axis."""
-        return constant_velocity(2, accel=lambda manoeuvre: manoeuvre, kind="white").bind([self.chain()])
+    def chain(self) -> Chain:
+        """Return the chain of manoeuvres."""
+        labels = [f"level{i}" for i in range(len(self.accel))]
+        if len(labels) == 1:
+            return Chain("manoeuvre", labels, trans=[[1.0]])
+        return Chain("manoeuvre", labels, sojourn=dict(zip(labels, self.sojourn, strict=True)))
 
     def prior(self) -> tuple[FloatArray, FloatArray]:
         """Return mean (4,) and covariance (4, 4) of (x, vx, y, vy) at an object's first measurement."""

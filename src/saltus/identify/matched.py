@@ -130,7 +130,7 @@ def _somewhere(settings: PairSettings, draws: int, rng: np.random.Generator) -> 
 def _walk(start: FloatArray, times: FloatArray, settings: PairSettings, rng: np.random.Generator) -> FloatArray:
     """States (D, K, 2, 2) at times, from those at the first of them."""
     chain = settings.chain()
-    density = np.array([float(str(v)) for v in chain.values])
+    density = settings.densities()
     dt = np.diff(times, prepend=times[0])
     trans = chain.transition(dt)
     mode = rng.choice(len(chain), size=len(start), p=chain.law)
