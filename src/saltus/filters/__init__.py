@@ -3,20 +3,29 @@
 from saltus.filters.bank import Bank
 from saltus.filters.coloured import augmented_filter, coloured_filter
 from saltus.filters.estimates import Estimates
+from saltus.filters.exact import ExactFilter, exact_filter
 from saltus.filters.grid import GridDensity, GridFilter
+from saltus.filters.histories import EXACT, GPB1, GPB2, INTERACTING, MergingRule
 from saltus.filters.imm import imm_filter
 from saltus.filters.run import IMM, Record
 from saltus.filters.steps import Belief
 
 __all__ = [
+    "EXACT",
+    "GPB1",
+    "GPB2",
     "IMM",
+    "INTERACTING",
     "Bank",
     "Belief",
     "Estimates",
+    "ExactFilter",
     "GridDensity",
     "GridFilter",
+    "MergingRule",
     "Record",
     "augmented_filter",
     "coloured_filter",
+    "exact_filter",
     "imm_filter",
 ]

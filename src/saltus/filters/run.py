@@ -16,7 +16,7 @@ from saltus.filters.linearise import Linearisation, sensor_update
 from saltus.models import Arrays, BoundSensor, HybridModel, LinearSensor, Observer
 from saltus.models.augment import coloured_sensors
 
-__all__ = ["IMM", "Record"]
+__all__ = ["IMM", "Record", "in_order"]
 
 _Array = npt.NDArray[np.float64]
 
@@ -88,16 +88,7 @@ class IMM:
         """
         if self.model is None:
             raise ModelError("this filter is bound to no model: write IMM(model).run(records).")
-        listed = [Record(*record) for record in records]
-        if not listed:
-            raise DataError("there is no record to filter.")
-        times = np.array([record.time for record in listed], dtype=np.float64)
-        back = np.flatnonzero(np.diff(times) < 0)
-        if len(back):
-            k = int(back[0]) + 1
-            raise DataError(
-                f"record {k} at {times[k]} s is older than record {k - 1} at {times[k - 1]} s; sort by time."
-            )
+        listed, times = in_order(records)
         sensors = self.model.sensors
         plain = all(isinstance(sensors.get(r.sensor), LinearSensor | None) and r.observer is None for r in listed)
         if coloured_sensors(self.model):
@@ -161,6 +152,25 @@ class _Row(NamedTuple):
     log_likelihood: float
     nis: float
     n_observed: int
+
+
+def in_order(
+    records: Iterable[Record | tuple[float, str, npt.ArrayLike] | tuple[float, str, npt.ArrayLike, Observer]],
+) -> tuple[list[Record], _Array]:
+    """List records with their times.
+
+    Raises:
+        DataError: there is no record, or time goes back.
+    """
+    listed = [Record(*record) for record in records]
+    if not listed:
+        raise DataError("there is no record to filter.")
+    times = np.array([record.time for record in listed], dtype=np.float64)
+    back = np.flatnonzero(np.diff(times) < 0)
+    if len(back):
+        k = int(back[0]) + 1
+        raise DataError(f"record {k} at {times[k]} s is older than record {k - 1} at {times[k - 1]} s; sort by time.")
+    return listed, times
 
 
 def _predicted(belief: steps.Belief, arrays: Arrays, k: int) -> steps.Belief:
