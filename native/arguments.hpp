@@ -77,6 +77,10 @@ std::vector<std::int64_t> numbers(const Index& index) {
   return out;
 }
 
+bool all_below(const std::vector<std::int64_t>& numbers, std::int64_t limit) {
+  return std::all_of(numbers.begin(), numbers.end(), [limit](std::int64_t i) { return i >= 0 && i < limit; });
+}
+
 // Owns what a Model points to.
 struct Held {
   Model model;
@@ -120,8 +124,7 @@ void read(Held& held, const char* name, nb::handle value, const Reading& as, con
   const Size per_step = Size(model.distinct) * model.core;
   model.time = as.timed && shape[1] > 1 ? per_step : 0;
   model.row = shape[0] > 1 ? per_step * (as.timed ? shape[1] : 1) : 0;
-  for (std::int64_t row : held.rows)
-    require(row >= 0 && row < shape[0], std::string(name) + ": a row number is out of range.");
+  require(all_below(held.rows, shape[0]), std::string(name) + ": a row number is out of range.");
   model.rows = held.rows.empty() ? nullptr : held.rows.data();
   held.which = as.modes.table({shape.begin() + lead, shape.begin() + lead + chains});
   model.which = held.which.data();

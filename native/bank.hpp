@@ -108,9 +108,17 @@ inline int measure_rows(const Tracks& t, Rows rows, bool write, int m, const dou
     V* free = models;
     const ByMode<V> h = staged(H, first, rows.count, free), o = staged(d, first, rows.count, free);
     const ByMode<V> r = staged(R, first, rows.count, free);
-    const I bad = (write ? steps.lanes.update : steps.score)(group.belief + t.modes, t.n, m, t.modes, h, o, r, value,
+    const I bad = (write ? steps.lanes.update : steps.lanes.score)(group.belief + t.modes, t.n, m, t.modes, h, o, r, value,
                                                              on, report, heap);
     if (any(bad)) status |= kNotPositive;
+    if (t.modes == 1) {  // one Gaussian has no law to reweigh, and is its own mixture
+      V log_det{};
+      for (int a = 0; a < m; ++a) log_det += logarithm(report[2 + a]);
+      const V likelihood = -0.5 * (report[0] + log_det + seen * kLog2Pi);
+      for (int l = 0; l < group.lanes; ++l) d2[first + l] = report[0][l], log_likelihood[first + l] = likelihood[l];
+      if (write) group.write_back();
+      continue;
+    }
     for (int j = 0; j < t.modes; ++j) law[j] = group.belief[j];
     bool logs = still_in_logs(law, t.modes);
     probabilities(law, logs, t.modes, law + t.modes);

@@ -46,6 +46,14 @@ struct Rows {
   std::ptrdiff_t count = 0;
 };
 
+// Where particles may go: P(next mode | now) by rows, the mode of each row, and per mode the first of equal dynamics.
+struct Branches {
+  int modes = 1;
+  const double* trans = nullptr;
+  const std::int64_t* now = nullptr;
+  const std::int64_t* same = nullptr;
+};
+
 // One instruction set. Workspaces are counted in doubles and aligned to 64 bytes by the caller.
 struct Kernel {
   const char* name;
@@ -62,6 +70,14 @@ struct Kernel {
   void (*bank_moments)(const Tracks&, Rows, double* mean, double* cov, double* probs, double* workspace);
   void (*bank_read)(const Tracks&, Rows, double* log_probs, double* means, double* covs, double* workspace);
   void (*bank_write)(const Tracks&, Rows, const double* log_probs, const double* means, const double* covs);
+  std::size_t (*expand_workspace)(const Tracks&, int modes, int m);
+  // z is (count, m), law (count, modes), log_likelihood (count,).
+  int (*bank_expand)(const Tracks&, Rows, const Branches&, int m, const double* z, const Model& F, const Model& b,
+                     const Model& Q, const Model& H, const Model& d, const Model& R, double* law,
+                     double* log_likelihood, double* workspace);
+  // `totals` is scratch, as many doubles as mass, means and covs together.
+  void (*bank_merge)(const Tracks&, Rows, const double* weight, const std::int64_t* label, std::ptrdiff_t labels,
+                     double* mass, double* means, double* covs, double* totals, double* workspace);
   void (*bank_copy)(const Tracks& from, Rows source, const Tracks& to, Rows target);
   // Does `rounds` x 16 x lanes independent fused multiply-adds: what the core can do at most.
   double (*multiply_adds)(std::int64_t rounds);

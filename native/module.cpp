@@ -207,6 +207,51 @@ class Bank {
     kernel_.bank_write(tracks_, rows, log_probs.data(), means.data(), covs.data());
   }
 
+  // Law of the next mode of every row, and log f(z); `same` names for each mode the first with the same dynamics.
+  int expand(const Index& index, const Index& now, const Index& same, const Array& trans, const Array& z, nb::handle F,
+             nb::handle b, nb::handle Q, nb::handle H, nb::handle d, nb::handle R, const Out& law,
+             const Out& log_likelihood) {
+    const std::vector<std::int64_t> held_rows = checked(index), modes_now = numbers(now), first = numbers(same);
+    const saltus::Rows rows{held_rows.data(), Size(held_rows.size())};
+    const Size M = Size(first.size()), n = tracks_.n, m = z.ndim() == 2 ? Size(z.shape(1)) : 0;
+    require(tracks_.chains == 0, "particles are rows of a bank without chains.");
+    require(M >= 1 && M <= kMostModes && trans.size() == std::size_t(M * M), "trans is (modes, modes).");
+    require(m && Size(z.shape(0)) == rows.count, "z has shape " + shape_of(z) + "; it is (k, m), a row per particle.");
+    check_sizes(n, m);
+    require(Size(modes_now.size()) == rows.count, "one present mode per particle is needed.");
+    require(all_below(modes_now, M), "a mode number is out of range.");
+    for (Size j = 0; j < M; ++j)
+      require(first[j] >= 0 && first[j] <= j && first[first[j]] == first[j], "same names no mode before its own.");
+    require(Size(law.size()) == rows.count * M && Size(log_likelihood.size()) == rows.count,
+            "outputs are (k, modes) and (k,).");
+    const Modes modes({int(M)});
+    const Reading as{modes, 1, 1, false};
+    Held f, u, q, h, o, r;
+    read(f, "F", F, as, {n, n});
+    read(u, "b", b, as, {n});
+    read(q, "Q", Q, as, {n, n});
+    read(h, "H", H, as, {m, n});
+    read(o, "d", d, as, {m});
+    read(r, "R", R, as, {m, m});
+    const saltus::Branches to{int(M), trans.data(), modes_now.data(), first.data()};
+    double* workspace = room(kernel_.expand_workspace(tracks_, int(M), int(m)));
+    return kernel_.bank_expand(tracks_, rows, to, int(m), z.data(), f.model, u.model, q.model, h.model, o.model,
+                               r.model, law.data(), log_likelihood.data(), workspace);
+  }
+
+  void merge(const Index& index, const Array& weight, const Index& label, const Out& mass, const Out& means,
+             const Out& covs) {
+    const std::vector<std::int64_t> held_rows = checked(index), labels = numbers(label);
+    const Size k = Size(held_rows.size()), L = Size(mass.size()), n = tracks_.n;
+    require(tracks_.chains == 0, "particles are rows of a bank without chains.");
+    require(Size(weight.size()) == k && Size(labels.size()) == k, "one weight and one label per row are needed.");
+    require(Size(means.size()) == L * n && Size(covs.size()) == L * n * n, "outputs are (L,), (L, n), (L, n, n).");
+    require(all_below(labels, L), "a label is out of range.");
+    std::vector<double> totals(L * (1 + n + n * n));
+    kernel_.bank_merge(tracks_, {held_rows.data(), k}, weight.data(), labels.data(), L, mass.data(), means.data(),
+                       covs.data(), totals.data(), space(1));
+  }
+
   void copy_from(const Index& target, const Bank& other, const Index& source) {
     const std::vector<std::int64_t> to = checked(target), from = other.checked(source);
     require(tracks_.n == other.tracks_.n && tracks_.modes == other.tracks_.modes && to.size() == from.size() &&
@@ -225,8 +270,9 @@ class Bank {
   }
 
   // Grows with the largest measurement seen, and serves every call.
-  double* space(int m) {
-    const std::size_t needed = kernel_.bank_workspace(tracks_, m);
+  double* space(int m) { return room(kernel_.bank_workspace(tracks_, m)); }
+
+  double* room(std::size_t needed) {
     if (needed > space_size_) {
       workspace_ = allocate(needed);
       space_size_ = needed;
@@ -265,5 +311,9 @@ NB_MODULE(_native, module) {
       .def("moments", &Bank::moments, rows, nb::arg(), nb::arg(), nb::arg())
       .def("read", &Bank::read_rows, rows, nb::arg(), nb::arg(), nb::arg())
       .def("write", &Bank::write_rows, rows, nb::arg(), nb::arg(), nb::arg())
+      .def("expand", &Bank::expand, rows, rows, rows, nb::arg(), nb::arg(), nb::arg(), nb::arg().none(), nb::arg(),
+           nb::arg(), nb::arg().none(), nb::arg(), nb::arg().noconvert(), nb::arg().noconvert())
+      .def("merge", &Bank::merge, rows, nb::arg(), rows, nb::arg().noconvert(), nb::arg().noconvert(),
+           nb::arg().noconvert())
       .def("copy_from", &Bank::copy_from, rows, nb::arg(), rows);
 }

@@ -65,11 +65,17 @@ inline void load_model(const Model& model, Size first, Size n_tracks, Size step,
     return;
   }
   const double* rows[W];
+  bool one = true;
   for (int l = 0; l < W; ++l) {
     rows[l] = address(model, first + l < n_tracks ? first + l : n_tracks - 1, step);
     // A stream per track is more than the hardware follows: ask for the row after the next.
     if (model.time)
       for (int i = 0; i < count; i += 8) __builtin_prefetch(rows[l] + 2 * model.time + i);
+    one = one && rows[l] == rows[0];
+  }
+  if (one) {  // particles lie sorted by mode
+    for (int i = 0; i < count; ++i) out[i] = splat(rows[0][i]);
+    return;
   }
   load_lanes(rows, count, out);
 }

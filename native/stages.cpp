@@ -5,9 +5,8 @@ namespace saltus::SALTUS_NS {
 
 template <int N, int M>
 constexpr Stages make() {
-  return Stages{{mix<N, double>, propagate<N, double>, measure<N, M, double, true>},
-                {mix<N, V>, propagate<N, V>, measure<N, M, V, true>},
-                measure<N, M, V, false>,
+  return Stages{{mix<N, double>, propagate<N, double>, measure<N, M, double, true>, measure<N, M, double, false>},
+                {mix<N, V>, propagate<N, V>, measure<N, M, V, true>, measure<N, M, V, false>},
                 collapse<N>,
                 mixture_nis<M>};
 }

@@ -11,13 +11,13 @@ struct StagesOf {
   void (*propagate)(V* state, int n, int modes, ByMode<E> F, ByMode<E> b, ByMode<E> Q, V* heap);
   I (*update)(V* state, int n, int m, int modes, ByMode<E> H, ByMode<E> d, ByMode<E> R, const V* z, const V* on,
               V* report, V* heap);
+  I (*score)(V* state, int n, int m, int modes, ByMode<E> H, ByMode<E> d, ByMode<E> R, const V* z, const V* on,
+             V* report, V* heap);
 };
 
 struct Stages {
   StagesOf<double> shared;
   StagesOf<V> lanes;
-  I (*score)(V* state, int n, int m, int modes, ByMode<V> H, ByMode<V> d, ByMode<V> R, const V* z, const V* on,
-             V* report, V* heap);
   void (*collapse)(const V* state, const V* probs, int n, int modes, V* out, V* heap);
   V (*nis)(const V* report, const V* probs, int m, int modes, V* heap);
 };

@@ -1,5 +1,5 @@
 // The kernel of one instruction set: SALTUS_NS names it, SALTUS_KERNEL is where the dispatcher finds it.
-#include "bank.hpp"
+#include "particles.hpp"
 #include "recursion.hpp"
 
 #define SALTUS_STRING(x) #x
@@ -50,6 +50,22 @@ void bank_write(const Tracks& t, Rows rows, const double* log_probs, const doubl
   write_rows(t, rows, log_probs, means, covs);
 }
 
+std::size_t expand_workspace(const Tracks& t, int modes, int m) {
+  V *copy, *states, *law, *report, *value, *on, *heap;
+  return (expand_space(t, modes, m, {}, &copy, &states, &law, &report, &value, &on, &heap) + modes + 1) * W;
+}
+
+int bank_expand(const Tracks& t, Rows rows, const Branches& to, int m, const double* z, const Model& F, const Model& b,
+                const Model& Q, const Model& H, const Model& d, const Model& R, double* law, double* log_likelihood,
+                double* workspace) {
+  return expand_rows(t, rows, to, m, z, F, b, Q, H, d, R, law, log_likelihood, arena(workspace));
+}
+
+void bank_merge(const Tracks& t, Rows rows, const double* weight, const std::int64_t* label, Size labels, double* mass,
+                double* means, double* covs, double* totals, double* workspace) {
+  merge_rows(t, rows, weight, label, labels, mass, means, covs, totals, arena(workspace));
+}
+
 double multiply_adds(std::int64_t rounds) {
   V sums[16];
   for (int i = 0; i < 16; ++i) sums[i] = splat(double(i));
@@ -64,8 +80,8 @@ double multiply_adds(std::int64_t rounds) {
 }
 
 const Kernel kernel{SALTUS_NAME(SALTUS_NS), W,          filter_workspace, filter,    bank_workspace, block_size,
-                    bank_step,              bank_measure, bank_moments,     bank_read, bank_write,     copy_rows,
-                    multiply_adds};
+                    bank_step,              bank_measure, bank_moments,     bank_read, bank_write,     expand_workspace,
+                    bank_expand,            bank_merge,   copy_rows,        multiply_adds};
 
 }  // namespace
 }  // namespace saltus::SALTUS_NS

@@ -31,4 +31,21 @@ class Bank:
     def moments(self, rows: _Rows, mean: _Array, cov: _Array, probs: _Array) -> None: ...
     def read(self, rows: _Rows, log_probs: _Array, means: _Array, covs: _Array) -> None: ...
     def write(self, rows: _Rows, log_probs: _Array, means: _Array, covs: _Array) -> None: ...
+    def expand(
+        self,
+        rows: _Rows,
+        now: _Rows,
+        same: _Rows,
+        trans: _Array,
+        z: _Array,
+        F: _Array,
+        b: _Array | None,
+        Q: _Array,
+        H: _Array,
+        d: _Array | None,
+        R: _Array,
+        law: _Array,
+        log_likelihood: _Array,
+    ) -> int: ...
+    def merge(self, rows: _Rows, weight: _Array, label: _Rows, mass: _Array, means: _Array, covs: _Array) -> None: ...
     def copy_from(self, rows: _Rows, other: Bank, other_rows: _Rows) -> None: ...

@@ -7,6 +7,7 @@ from saltus.filters.exact import ExactFilter, exact_filter
 from saltus.filters.grid import GridDensity, GridFilter
 from saltus.filters.histories import EXACT, GPB1, GPB2, INTERACTING, MergingRule
 from saltus.filters.imm import imm_filter
+from saltus.filters.rao_blackwell import particle_filter
 from saltus.filters.run import IMM, Record
 from saltus.filters.steps import Belief
 
@@ -28,4 +29,5 @@ __all__ = [
     "coloured_filter",
     "exact_filter",
     "imm_filter",
+    "particle_filter",
 ]

@@ -13,12 +13,14 @@ from saltus.errors import ModelError
 from saltus.filters import steps
 from saltus.filters.backend import MOST_MODES, MOST_STATES, Backend, use_native
 from saltus.filters.memoryless import merge
+from saltus.filters.particles import Merged, Tables, expanded, merged
 from saltus.filters.steps import Belief
 from saltus.linalg import logsumexp
 
 __all__ = ["Bank", "NumpyStore"]
 
 _Rows = npt.NDArray[np.intp]
+_Modes = npt.NDArray[np.int64]
 _Array = npt.NDArray[np.float64]
 
 
@@ -28,6 +30,9 @@ class Bank:
     All rows share the number of states `n` and the chains' sizes; their matrices may differ: `F`, `Q`, `H`, `R`
     are `(k|1, M1|1, ..., MC|1, rows, cols)` for the `k` rows addressed, and so are `b`, `d` with one trailing axis.
     `trans[c]` is `(Mc, Mc)`, `(k, Mc, Mc)` or None for a chain that cannot switch.
+
+    With `mode`, row i looks its matrices up: arrays are tables `(M|1, rows, cols)` and row i takes `table[mode[i]]`.
+    That is for particles, rows of a bank without chains whose joint mode is known (`expand`, `merged`).
 
     A row number is valid from `add` until `remove`; freed rows are used again.
     """
@@ -83,12 +88,22 @@ class Bank:
         """Overwrite `rows` with copies of another bank's rows."""
         self._store.copy_from(rows, other._store, other_rows)
 
-    def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None:
+    def step(
+        self,
+        rows: _Rows,
+        trans: Sequence[_Array | None],
+        F: _Array,
+        b: _Array | None,
+        Q: _Array,
+        *,
+        mode: _Modes | None = None,
+    ) -> None:
         """Mix and propagate rows over their intervals (no row twice)."""
+        F, b, Q = self._store.looked_up(mode, F, b, Q)
         self._store.step(rows, trans, F, b, Q)
 
     def score(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, mode: _Modes | None = None
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Return gate distance d2 and log f(z) of measurement z[i] for row rows[i] (repeats allowed).
 
@@ -97,16 +112,18 @@ class Bank:
         Raises:
             NumericalError: an innovation covariance is not positive definite.
         """
+        H, d, R = self._store.looked_up(mode, H, d, R)
         return self._store.measure(rows, z, H, d, R, write=False)
 
     def update(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, mode: _Modes | None = None
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Condition row rows[i] on z[i] (no row twice); return d2 and log f(z) as `score` does.
 
         Raises:
             NumericalError: an innovation covariance is not positive definite; what the rows hold is then undefined.
         """
+        H, d, R = self._store.looked_up(mode, H, d, R)
         return self._store.measure(rows, z, H, d, R, write=True)
 
     def score_each(self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array) -> Float[np.ndarray, "k h"]:
@@ -160,6 +177,29 @@ class Bank:
         self.write(rows, Belief(*(a[:, 0] for a in merged)))
         return total[:, 0], log_posterior
 
+    def expand(
+        self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables
+    ) -> tuple[Float[np.ndarray, "k modes"], Float[np.ndarray, " k"]]:
+        """Return P(next mode | row, z) and log f(z | row) of particles; the rows stay as they are.
+
+        P_j ~ trans[now, j] N(z; H_j (F_j x + b_j) + d_j, H_j (F_j P F_j' + Q_j) H_j' + R_j)
+
+        Args:
+            rows: of a bank without chains.
+            now: present joint mode of each row, (k,).
+            trans: P(next = j | now = i), (M, M).
+            z: measurement of each row, (k, m); NaN is a missing component.
+            tables: matrices by mode, (M|1, ...) each.
+
+        Raises:
+            NumericalError: an innovation covariance is not positive definite.
+        """
+        return self._store.expand(rows, now, trans, z, tables)
+
+    def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:
+        """Return total weight, mean and covariance of the rows of each label, particles of a bank without chains."""
+        return self._store.merged(rows, weights, labels, n_labels)
+
     def moments(
         self, rows: _Rows
     ) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n n"], Float[np.ndarray, "k *_sizes"]]:
@@ -187,6 +227,9 @@ class _Store(Protocol):
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, write: bool
     ) -> tuple[_Array, _Array]: ...
     def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]: ...
+    def looked_up(self, mode: _Modes | None, a: _Array, b: _Array | None, c: _Array) -> tuple[Any, Any, Any]: ...
+    def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]: ...
+    def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged: ...
 
 
 def _make_store(n: int, sizes: tuple[int, ...], capacity: int, backend: Backend | None) -> _Store:
@@ -258,6 +301,22 @@ class NumpyStore:
         belief = self.read(rows)
         mean, cov = steps.collapse(*belief, self._n_chains)
         return mean, cov, np.exp(belief.log_probs)
+
+    def looked_up(self, mode: _Modes | None, a: _Array, b: _Array | None, c: _Array) -> tuple[Any, Any, Any]:
+        """Spell out the matrices of every row."""
+
+        def spelt(t: _Array | None) -> _Array | None:
+            return t if t is None or mode is None or len(t) == 1 else t[mode]
+
+        return spelt(a), spelt(b), spelt(c)
+
+    def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]:
+        """Return P(next mode | row, z) and log f(z | row)."""
+        return expanded(self._means[rows], self._covs[rows], now, trans, z, tables)
+
+    def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:
+        """Return total weight, mean and covariance of the rows of each label."""
+        return merged(self._means[rows], self._covs[rows], weights, labels, n_labels)
 
 
 def _enlarged(a: _Array, rows: int) -> _Array:

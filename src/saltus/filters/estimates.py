@@ -29,7 +29,9 @@ class Estimates:
             when the model is right and one mode dominates.
         n_observed: number of components measured, (*batch, T).
         mode_means, mode_covs: per mode, (*batch, T, M1, ..., MC, n[, n]); None unless per_mode.
-        error: the filter's own error estimate (reference filters), else None.
+        error: the filter's own error estimate (reference filters), else None: how far the mean may be from the exact
+            one, in posterior standard deviations, (*batch, T).
+        effective: share of the particles that count after each measurement (particle filters), else None.
         chains: names of the chains, in axis order.
         times: times of the rows in s, or None.
     """
@@ -44,6 +46,7 @@ class Estimates:
     mode_means: Float[np.ndarray, "*modes n"] | None = None
     mode_covs: Float[np.ndarray, "*modes n n"] | None = None
     error: Float[np.ndarray, "*rows"] | None = None
+    effective: Float[np.ndarray, "*rows"] | None = None
     chains: tuple[str, ...] = ()
     times: Float[np.ndarray, " t"] | None = None
 

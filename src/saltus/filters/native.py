@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from math import prod
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,12 +11,14 @@ from saltus.errors import ModelError, NumericalError
 from saltus.filters.align import Aligned
 from saltus.filters.backend import instruction_set, native_module, thread_count
 from saltus.filters.estimates import Estimates
+from saltus.filters.particles import Merged, Tables
 from saltus.filters.steps import NOT_POSITIVE, Belief
 
 __all__ = ["NativeStore", "filter_native"]
 
 _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
+_Modes = npt.NDArray[np.int64]
 
 _NOT_POSITIVE, _INFINITE, _DOUBTFUL = 1, 2, 4  # bits of the kernel's status
 _WRITTEN = ("probs", "mean", "cov", "log_likelihood", "nis", "n_observed", "mode_means", "mode_covs")
@@ -169,6 +172,30 @@ class NativeStore:
         mean, cov, probs = np.empty((k, n)), np.empty((k, n, n)), np.empty((k, *self._sizes))
         self._lanes.moments(rows, mean, cov, probs)
         return mean, cov, probs
+
+    def looked_up(self, mode: _Modes | None, a: _Array, b: _Array | None, c: _Array) -> tuple[Any, Any, Any]:
+        """Pair tables with the row of them that each row of the bank takes."""
+
+        def paired(t: _Array | None) -> object:
+            return t if t is None or mode is None or len(t) == 1 else (np.ascontiguousarray(t), mode)
+
+        return paired(a), paired(b), paired(c)
+
+    def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]:
+        """Return P(next mode | row, z) and log f(z | row)."""
+        law, log_f = np.empty((len(rows), len(trans))), np.empty(len(rows))
+        F, b, Q, H, d, R = tables
+        same = tables.same(len(trans))
+        if self._lanes.expand(rows, now, same, trans, z, F, b, Q, H, d, R, law, log_f) & _NOT_POSITIVE:
+            raise NumericalError(NOT_POSITIVE)
+        return law, log_f
+
+    def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:
+        """Return total weight, mean and covariance of the rows of each label."""
+        n = self._n
+        out = Merged(np.empty(n_labels), np.empty((n_labels, n)), np.empty((n_labels, n, n)))
+        self._lanes.merge(rows, weights, labels, *out)
+        return out
 
 
 def _full(a: _Array, shape: tuple[int, ...]) -> _Array:

@@ -1,0 +1,280 @@
+"""The Rao-Blackwellised particle filter of a jump linear system: particles are histories of modes, a Gaussian each.
+
+Given its modes the system is linear and Gaussian, so a particle carries a Kalman filter and only the modes are drawn.
+A step asks every particle what each next mode would make of the measurement, draws as many (particle, next mode) pairs
+as there are particles from their joint posterior, all by one uniform number, and moves those. The proposal is optimal:
+no weight depends on what was drawn, and no particle goes where the measurement forbids.
+
+Particles live in independent groups, each a filter of its own; the answer is their average, and its spread over the
+groups is the filter's own error.
+
+Source: Doucet, de Freitas, Murphy and Russell (2000); optimal proposal and resampling before moving: Doucet, Gordon and
+Krishnamurthy (2001), Particle filters for state estimation of jump Markov linear systems, IEEE Trans. SP 49(3); Pitt
+and Shephard (1999) for the fully adapted auxiliary filter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.errors import ModelError
+from saltus.filters import steps
+from saltus.filters.align import align
+from saltus.filters.backend import Backend
+from saltus.filters.bank import Bank
+from saltus.filters.estimates import Estimates
+from saltus.filters.flat import Flat, flatten
+from saltus.filters.particles import Tables, effective_size, generator, group_error
+from saltus.linalg import logsumexp
+
+__all__ = ["check_groups", "particle_filter"]
+
+_Array = npt.NDArray[np.float64]
+_Modes = npt.NDArray[np.int64]
+_AT_ONCE = 4_000_000  # particles times modes held at once
+
+
+def particle_filter(
+    z: npt.ArrayLike,
+    *,
+    F: npt.ArrayLike,
+    Q: npt.ArrayLike,
+    H: npt.ArrayLike,
+    R: npt.ArrayLike,
+    trans: Sequence[npt.ArrayLike],
+    mean0: npt.ArrayLike,
+    cov0: npt.ArrayLike,
+    probs0: npt.ArrayLike,
+    b: npt.ArrayLike | None = None,
+    d: npt.ArrayLike | None = None,
+    n_particles: int = 1000,
+    groups: int = 8,
+    rng: np.random.Generator | None = None,
+    per_mode: bool = False,
+    backend: Backend | None = None,
+) -> Estimates:
+    """Filter with particles for the modes and a Kalman filter in each; other arguments are those of `imm_filter`.
+
+    Args:
+        z: measurements, (*batch, T, m); NaN is a missing component.
+        F: transition matrices, (..., n, n), over (t_{k-1}, t_k].
+        Q: process noise covariances, (..., n, n).
+        H: measurement matrices, (..., m, n).
+        R: measurement noise covariances, (..., m, m).
+        trans: one matrix per chain, trans[c][i, j] = P(next = j | now = i).
+        mean0: prior mean one interval before z[0].
+        cov0: its covariance.
+        probs0: prior law of the modes.
+        b: known input, (..., n).
+        d: known measurement offset, (..., m).
+        n_particles: particles of each run, all groups together; rounded up to a multiple of groups.
+        groups: independent filters they are divided among, for the error.
+        rng: source of randomness.
+        per_mode: also return every mode's mean and covariance (zeros where no particle is).
+        backend: "numpy" for the definition, "native" for the compiled bank; None chooses.
+
+    Returns:
+        Estimates; `error` is the distance, in posterior standard deviations, within which the exact mean lies of the
+        one returned, at 95 % confidence (`particles.group_error`), and `effective` the share of particles that count.
+
+    Raises:
+        ModelError: a shape or a law that cannot be, too few particles, or no rng.
+        DataError: inf in z, NaN or inf elsewhere.
+        NumericalError: an innovation covariance is not positive definite.
+    """
+    source = generator(rng)
+    size = check_groups(n_particles, groups)
+    model = align(z, F=F, Q=Q, H=H, R=R, trans=trans, mean0=mean0, cov0=cov0, probs0=probs0, b=b, d=d)
+    flat = flatten(model)
+    parts = [_filter(part, size, groups, source, backend) for part in _divided(flat, size * groups)]
+    rows = _Rows(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    return _estimates(rows, flat, model.z.shape[:-2], per_mode)
+
+
+def check_groups(n_particles: int, groups: int) -> int:
+    """Return the particles per group.
+
+    Raises:
+        ModelError: fewer than two groups, or of two particles.
+    """
+    if groups < 2 or n_particles < 2 * groups:
+        raise ModelError(
+            f"n_particles = {n_particles} in {groups} groups: give at least two groups (their spread is the error) "
+            "of at least two particles; hundreds each are usual."
+        )
+    return -(-n_particles // groups)
+
+
+class _Rows(NamedTuple):
+    """What each run and row gives."""
+
+    probs: _Array  # (B, T, M)
+    group_means: _Array  # (B, T, G, n)
+    mean: _Array  # (B, T, n)
+    cov: _Array
+    mode_means: _Array  # (B, T, M, n)
+    mode_covs: _Array
+    log_likelihood: _Array  # (B, T)
+    nis: _Array
+    effective: _Array
+
+
+def _divided(flat: Flat, n_particles: int) -> list[Flat]:
+    """Runs at once: one where matrices differ from run to run, else as many as memory is meant for."""
+    arrays = [a for a in (*flat.arrays, *flat.chains, flat.log_probs0, flat.mean0, flat.cov0) if a is not None]
+    own = any(len(a) > 1 for a in arrays)
+    count = 1 if own else max(1, _AT_ONCE // (n_particles * flat.n_modes))
+
+    def cut(a: _Array, runs: slice) -> _Array:
+        return a if len(a) == 1 else a[runs]
+
+    parts = []
+    for first in range(0, flat.n_runs, count):
+        runs = slice(first, first + count)
+        parts.append(
+            replace(
+                flat,
+                z=flat.z[runs],
+                seen=flat.seen[runs],
+                chains=tuple(None if c is None else cut(c, runs) for c in flat.chains),
+                arrays=tuple(None if a is None else cut(a, runs) for a in flat.arrays),
+                log_probs0=cut(flat.log_probs0, runs),
+                mean0=cut(flat.mean0, runs),
+                cov0=cut(flat.cov0, runs),
+            )
+        )
+    return parts
+
+
+def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backend: Backend | None) -> _Rows:
+    B, M = flat.n_runs, flat.n_modes
+    lots = B * groups  # independent filters of `size` particles
+    rows = np.arange(lots * size)
+    bank, mode = _start(flat, lots, size, rng, backend)
+    of_lot = np.repeat(np.arange(lots), size)
+    z_all = np.where(flat.seen, flat.z, np.nan)
+    weights = np.full(lots * size, 1.0 / size)
+    now = _moments(bank, rows, weights, of_lot * M + mode, (B, groups, M))[0]
+    out = []
+    for k in range(flat.n_steps):
+        tables, trans = _tables(flat, k), flat.trans(k)[0]
+        z = np.repeat(z_all[:, k], groups * size, axis=0)
+        law, log_f = bank.expand(rows, mode, trans, z, tables)
+        first = log_f.reshape(lots, size)
+        likelihood = logsumexp(first, (1,))
+        share = np.exp(first - likelihood)
+        probs = (share[:, None, :] @ law.reshape(lots, size, M))[:, 0]
+        bank, mode = _drawn(bank, share, law, rng)
+        F, b, Q, H, d, R = tables
+        bank.step(rows, [], F, b, Q, mode=mode)
+        bank.update(rows, z, H, d, R, mode=mode)
+        nis = _nis(now, flat, k)
+        now, group_means, mean, cov = _moments(bank, rows, weights, of_lot * M + mode, (B, groups, M))
+        log_f_runs = logsumexp(likelihood.reshape(B, groups), (1,))[:, 0] - np.log(groups * size)
+        out.append(
+            _Rows(
+                probs.reshape(B, groups, M).mean(1),
+                group_means,
+                mean,
+                cov,
+                now.means,
+                now.covs,
+                np.where(flat.seen[:, k].any(-1), log_f_runs, 0.0),
+                nis,
+                effective_size(share).reshape(B, groups).mean(1) / size,
+            )
+        )
+    return _Rows(*(np.stack(arrays, axis=1) for arrays in zip(*out, strict=True)))
+
+
+def _start(flat: Flat, lots: int, size: int, rng: np.random.Generator, backend: Backend | None) -> tuple[Bank, _Modes]:
+    """Draw the prior's modes; each particle then has the prior's Gaussian."""
+    M, n = flat.n_modes, flat.mean0.shape[-1]
+    law = np.cumsum(np.exp(flat.log_probs0[0]))
+    points = (rng.uniform(size=(lots, 1)) + np.arange(size)) / size
+    mode = np.searchsorted(law[:-1], points.ravel() * law[-1], side="right").astype(np.int64)
+    mean0 = np.broadcast_to(flat.mean0[0], (M, n))[mode]
+    cov0 = np.broadcast_to(flat.cov0[0], (M, n, n))[mode]
+    bank = Bank(n, (), capacity=lots * size, backend=backend)
+    bank.add(steps.Belief(np.zeros(lots * size), mean0, cov0))
+    return bank, mode
+
+
+def _tables(flat: Flat, k: int) -> Tables:
+    """Matrices of row k, spelt out by mode where they depend on it."""
+    every = np.arange(flat.n_modes)
+    F, b, Q, H, d, R = (None if a is None else a[0] for a in flat.matrices(k, every))
+    if F is None or Q is None or H is None or R is None:
+        raise TypeError("F, Q, H and R are always there")
+    return Tables(F, b, Q, H, d, R)
+
+
+def _drawn(bank: Bank, share: _Array, law: _Array, rng: np.random.Generator) -> tuple[Bank, _Modes]:
+    """Draw (particle, next mode) pairs from their joint law by one uniform number per group.
+
+    Pairs of one next mode lie side by side: each mode is drawn in proportion but for less than one particle, and the
+    particles that follow are sorted by mode, as the kernel likes them.
+    """
+    lots, size = share.shape
+    cells = share[:, None, :] * law.reshape(lots, size, -1).swapaxes(1, 2)
+    bounds = np.cumsum(cells.reshape(lots, -1), axis=1)
+    ends = np.ceil(bounds * (size / bounds[:, -1:]) - rng.uniform(size=(lots, 1))).astype(np.int64)
+    np.clip(ends, 0, size, out=ends)
+    ends[:, -1] = size
+    taken = np.repeat(np.arange(cells.size), np.diff(ends, axis=1, prepend=0).ravel())
+    mode, parents = np.divmod(taken.reshape(lots, size) - cells[0].size * np.arange(lots)[:, None], size)
+    return bank.take((parents + size * np.arange(lots)[:, None]).ravel()), mode.ravel()
+
+
+def _moments(
+    bank: Bank, rows: _Modes, weights: _Array, labels: _Modes, shape: tuple[int, int, int]
+) -> tuple[steps.Belief, _Array, _Array, _Array]:
+    """Belief by mode (B, M), means of the groups (B, G, n), mean and covariance (B, n[, n])."""
+    B, G, M = shape
+    mass, means, covs = bank.merged(rows, weights, labels, B * G * M)
+    n = means.shape[-1]
+    with np.errstate(divide="ignore"):
+        log_mass = np.log(mass).reshape(B, G, M)
+    means, covs = means.reshape(B, G, M, n), covs.reshape(B, G, M, n, n)
+    groups = steps.collapse(log_mass, means, covs, 1)
+    mean, cov = steps.collapse(np.full((B, G), -np.log(G)), *groups, 1)
+    # Modes without any particle have zeros for moments, and weigh nothing.
+    by_group, total = np.moveaxis(log_mass, 1, -1), logsumexp(log_mass, (1,))[:, 0]
+    given = by_group - np.where(np.isfinite(total), total, 0.0)[..., None]
+    merged = steps.collapse(given, np.moveaxis(means, 1, -2), np.moveaxis(covs, 1, -3), 1)
+    return steps.Belief(total - np.log(G), *merged), groups[0], mean, cov
+
+
+def _nis(now: steps.Belief, flat: Flat, k: int) -> _Array:
+    """Distance of the measurement from its prediction; merging by mode leaves the prediction's two moments exact."""
+    seen = flat.seen[:, k]
+    if not seen.any():
+        return np.zeros(flat.n_runs)
+    log_probs, means, covs = steps.mix(*now, [flat.trans(k)])
+    F, b, Q, H, d, R = flat.matrices(k, np.arange(flat.n_modes))
+    prediction = steps.measure(*steps.propagate(means, covs, F, b, Q), H, d, R)
+    return steps.mixture_nis(log_probs, prediction, flat.z[:, k], seen, 1)
+
+
+def _estimates(rows: _Rows, flat: Flat, batch: tuple[int, ...], per_mode: bool) -> Estimates:
+    n = rows.mean.shape[-1]
+
+    def shaped(a: _Array, *core: int) -> _Array:
+        return np.ascontiguousarray(a).reshape(*batch, flat.n_steps, *core)
+
+    return Estimates(
+        probs=shaped(rows.probs, *flat.sizes),
+        mean=shaped(rows.mean, n),
+        cov=shaped(rows.cov, n, n),
+        log_likelihood=shaped(rows.log_likelihood),
+        log_likelihood_start=np.zeros(batch),
+        nis=shaped(rows.nis),
+        n_observed=shaped(flat.seen.sum(-1).astype(float)),
+        mode_means=shaped(rows.mode_means, *flat.sizes, n) if per_mode else None,
+        mode_covs=shaped(rows.mode_covs, *flat.sizes, n, n) if per_mode else None,
+        error=shaped(group_error(rows.group_means, rows.cov)),
+        effective=shaped(rows.effective),
+    )
