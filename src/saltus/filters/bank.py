@@ -99,8 +99,7 @@ class Bank:
         mode: _Modes | None = None,
     ) -> None:
         """Mix and propagate rows over their intervals (no row twice)."""
-        F, b, Q = self._store.looked_up(mode, F, b, Q)
-        self._store.step(rows, trans, F, b, Q)
+        self._store.step(rows, trans, F, b, Q, mode)
 
     def score(
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, mode: _Modes | None = None
@@ -112,8 +111,7 @@ class Bank:
         Raises:
             NumericalError: an innovation covariance is not positive definite.
         """
-        H, d, R = self._store.looked_up(mode, H, d, R)
-        return self._store.measure(rows, z, H, d, R, write=False)
+        return self._store.measure(rows, z, H, d, R, mode, write=False)
 
     def update(
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, mode: _Modes | None = None
@@ -123,8 +121,7 @@ class Bank:
         Raises:
             NumericalError: an innovation covariance is not positive definite; what the rows hold is then undefined.
         """
-        H, d, R = self._store.looked_up(mode, H, d, R)
-        return self._store.measure(rows, z, H, d, R, write=True)
+        return self._store.measure(rows, z, H, d, R, mode, write=True)
 
     def score_each(self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array) -> Float[np.ndarray, "k h"]:
         """Return log f(z) of measurement z[i] for row rows[i] (repeats allowed) under h noise covariances.
@@ -222,12 +219,19 @@ class _Store(Protocol):
     def write(self, rows: _Rows, belief: Belief) -> None: ...
     def take(self, rows: _Rows) -> "_Store": ...
     def copy_from(self, rows: _Rows, other: Any, other_rows: _Rows) -> None: ...
-    def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None: ...
+    def step(
+        self,
+        rows: _Rows,
+        trans: Sequence[_Array | None],
+        F: _Array,
+        b: _Array | None,
+        Q: _Array,
+        mode: _Modes | None = None,
+    ) -> None: ...
     def measure(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, write: bool
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, mode: _Modes | None = None, *, write: bool
     ) -> tuple[_Array, _Array]: ...
     def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]: ...
-    def looked_up(self, mode: _Modes | None, a: _Array, b: _Array | None, c: _Array) -> tuple[Any, Any, Any]: ...
     def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]: ...
     def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged: ...
 
@@ -275,15 +279,25 @@ class NumpyStore:
         """Overwrite rows with those of another store."""
         self.write(rows, other.read(other_rows))
 
-    def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None:
+    def step(
+        self,
+        rows: _Rows,
+        trans: Sequence[_Array | None],
+        F: _Array,
+        b: _Array | None,
+        Q: _Array,
+        mode: _Modes | None = None,
+    ) -> None:
         """Mix and propagate rows."""
         log_probs, means, covs = steps.mix(*self.read(rows), trans)
+        F, Q, b = _looked_up(F, mode), _looked_up(Q, mode), None if b is None else _looked_up(b, mode)
         self.write(rows, Belief(log_probs, *steps.propagate(means, covs, F, b, Q)))
 
     def measure(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, write: bool
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, mode: _Modes | None = None, *, write: bool
     ) -> tuple[_Array, _Array]:
         """Return d2 and log f(z); condition the rows when `write`."""
+        H, R, d = _looked_up(H, mode), _looked_up(R, mode), None if d is None else _looked_up(d, mode)
         log_probs, means, covs = self.read(rows)
         seen = ~np.isnan(z)
         z = np.where(seen, z, 0.0)
@@ -302,14 +316,6 @@ class NumpyStore:
         mean, cov = steps.collapse(*belief, self._n_chains)
         return mean, cov, np.exp(belief.log_probs)
 
-    def looked_up(self, mode: _Modes | None, a: _Array, b: _Array | None, c: _Array) -> tuple[Any, Any, Any]:
-        """Spell out the matrices of every row."""
-
-        def spelt(t: _Array | None) -> _Array | None:
-            return t if t is None or mode is None or len(t) == 1 else t[mode]
-
-        return spelt(a), spelt(b), spelt(c)
-
     def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]:
         """Return P(next mode | row, z) and log f(z | row)."""
         return expanded(self._means[rows], self._covs[rows], now, trans, z, tables)
@@ -317,6 +323,10 @@ class NumpyStore:
     def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:
         """Return total weight, mean and covariance of the rows of each label."""
         return merged(self._means[rows], self._covs[rows], weights, labels, n_labels)
+
+
+def _looked_up(table: _Array, mode: _Modes | None) -> _Array:
+    return table if mode is None or len(table) == 1 else table[mode]
 
 
 def _enlarged(a: _Array, rows: int) -> _Array:

@@ -153,16 +153,27 @@ class NativeStore:
         """Overwrite rows with those of another store."""
         self._lanes.copy_from(rows, other._lanes, other_rows)
 
-    def step(self, rows: _Rows, trans: Sequence[_Array | None], F: _Array, b: _Array | None, Q: _Array) -> None:
+    def step(
+        self,
+        rows: _Rows,
+        trans: Sequence[_Array | None],
+        F: _Array,
+        b: _Array | None,
+        Q: _Array,
+        mode: _Modes | None = None,
+    ) -> None:
         """Mix and propagate rows."""
-        self._lanes.step(rows, trans, F, b, Q)
+        self._lanes.step(
+            rows, trans, _looked_up(F, mode), None if b is None else _looked_up(b, mode), _looked_up(Q, mode)
+        )
 
     def measure(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, write: bool
+        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, mode: _Modes | None = None, *, write: bool
     ) -> tuple[_Array, _Array]:
         """Return d2 and log f(z); condition the rows when `write`."""
         d2, log_f = np.empty(len(rows)), np.empty(len(rows))
-        if self._lanes.measure(rows, write, z, H, d, R, d2, log_f) & _NOT_POSITIVE:
+        by_mode = _looked_up(H, mode), None if d is None else _looked_up(d, mode), _looked_up(R, mode)
+        if self._lanes.measure(rows, write, z, *by_mode, d2, log_f) & _NOT_POSITIVE:
             raise NumericalError(NOT_POSITIVE)
         return d2, log_f
 
@@ -172,14 +183,6 @@ class NativeStore:
         mean, cov, probs = np.empty((k, n)), np.empty((k, n, n)), np.empty((k, *self._sizes))
         self._lanes.moments(rows, mean, cov, probs)
         return mean, cov, probs
-
-    def looked_up(self, mode: _Modes | None, a: _Array, b: _Array | None, c: _Array) -> tuple[Any, Any, Any]:
-        """Pair tables with the row of them that each row of the bank takes."""
-
-        def paired(t: _Array | None) -> object:
-            return t if t is None or mode is None or len(t) == 1 else (np.ascontiguousarray(t), mode)
-
-        return paired(a), paired(b), paired(c)
 
     def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]:
         """Return P(next mode | row, z) and log f(z | row)."""
@@ -196,6 +199,11 @@ class NativeStore:
         out = Merged(np.empty(n_labels), np.empty((n_labels, n)), np.empty((n_labels, n, n)))
         self._lanes.merge(rows, weights, labels, *out)
         return out
+
+
+def _looked_up(table: _Array, mode: _Modes | None) -> Any:
+    """A table with the row of it that each row of the bank takes."""
+    return table if mode is None or len(table) == 1 else (np.ascontiguousarray(table), mode)
 
 
 def _full(a: _Array, shape: tuple[int, ...]) -> _Array:

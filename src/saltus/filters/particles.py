@@ -62,14 +62,15 @@ def expanded(
 ) -> tuple[Float[np.ndarray, "k modes"], Float[np.ndarray, " k"]]:
     """Return P(next mode | particle, z) and log f(z | particle): see `Bank.expand`."""
     F, b, Q, H, d, R = tables
-    x, P = steps.propagate(means[:, None], covs[:, None], F, b, Q)
+    k, M, n = len(means), len(trans), means.shape[-1]
+    spread = np.broadcast_to(means[:, None], (k, M, n)), np.broadcast_to(covs[:, None], (k, M, n, n))
+    x, P = steps.propagate(*spread, F, b, Q)
     seen = ~np.isnan(z)
-    lead = np.broadcast_shapes(x.shape[:-1], (len(z), len(trans)))
     with np.errstate(divide="ignore"):
         law = np.log(trans)[now]
     prediction = steps.measure(x, P, H, d, R)
     done = steps.condition(prediction, np.where(seen, z, 0.0)[:, None], seen[:, None])
-    law, log_f = steps.reweigh(law, np.broadcast_to(done.loglik, lead), 1)
+    law, log_f = steps.reweigh(law, done.loglik, 1)
     return np.exp(law), log_f
 
 
