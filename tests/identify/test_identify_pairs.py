@@ -1,11 +1,13 @@
 """Ratios of many pairs on the batch kernel, against one pair at a time: another recursion, a dense solution, loops."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from scipy.linalg import block_diag, expm
 
-from oracles import FlatModel, dense_kalman, textbook_imm
+from oracles import FlatModel, Run, dense_kalman, textbook_imm
 from saltus import DataError, ModelError, identification_llr
 from saltus.identify import LocalTracks, PairSettings, candidate_pairs, pair_ratios
 from strategies import quick, random_cov, rngs
@@ -22,6 +24,8 @@ OFFSET = PairSettings(
     region_cov=SPREAD**2 * np.array([[1.0, 0.3], [0.3, 0.8]]),
     speed_sigma=SPEED,
 )
+CLOCK = replace(OFFSET, offset_cov=np.zeros((2, 2)), time_sigma=0.7)
+FAULTY = replace(OFFSET, time_sigma=0.7, outlier_probability=0.05, outlier_factor=6.0)
 
 
 def tracks_of(rng, lives, every=4.0):
@@ -49,59 +53,73 @@ def merged(a, b, i, j):
     return system[order], time[order], z[order], R[order], begin, later
 
 
-def model(settings, time, system, z, R, offset_of):
-    """The filter of some rows in full; the system `offset_of` (None: neither) carries two more states."""
-    dt = np.diff(time, prepend=time[0])
-    n_modes, n = len(settings.accel), 4 if offset_of is None else 6
-    F, Q, H = np.zeros((len(dt), n_modes, n, n)), np.zeros((len(dt), n_modes, n, n)), np.zeros((len(dt), n_modes, 2, n))
+def model(settings, time, system, z, R, late, velocity=None):
+    """The filter of some rows in full; rows of the system `late` (None: neither) differ by more states."""
+    dt, sizes = np.diff(time, prepend=time[0]), [len(settings.accel), 2 if settings.outlier_probability else 1]
+    offset = late is not None and bool(np.any(settings.offset_cov))
+    clock = late is not None and settings.time_sigma > 0
+    n = 4 + 2 * offset + clock
+    F, Q, H = (np.zeros((len(dt), *sizes, *core)) for core in ((n, n), (n, n), (2, n)))
     leave = np.array(settings.sojourn) ** -1.0
-    rates = np.array([[-leave[0], leave[0]], [leave[1], -leave[1]]]) if n_modes == 2 else np.zeros((1, 1))
+    rates = np.array([[-leave[0], leave[0]], [leave[1], -leave[1]]]) if sizes[0] == 2 else np.zeros((1, 1))
     for k, d in enumerate(dt):
         axis = np.array([[d**3 / 3, d**2 / 2], [d**2 / 2, d]])
         kept = np.exp(-d / settings.offset_time)
+        more = [[kept * np.eye(2)] * offset + [np.eye(1)] * clock]
+        more += [[(1 - kept**2) * settings.offset_cov] * offset + [np.zeros((1, 1))] * clock]
         for m, accel in enumerate(settings.accel):
-            blocks = [[[1.0, d], [0.0, 1.0]]] * 2, [accel**2 * settings.accel_time * axis] * 2
-            extra = ([kept * np.eye(2)], [(1 - kept**2) * settings.offset_cov]) if n == 6 else ([], [])
-            F[k, m], Q[k, m] = (block_diag(*main, *more) for main, more in zip(blocks, extra, strict=True))
-        H[k, :, 0, 0] = H[k, :, 1, 2] = 1.0
-        if n == 6:
-            H[k, :, :, 4:] = (system[k] == offset_of) * np.eye(2)
+            F[k, m] = block_diag(*[[[1.0, d], [0.0, 1.0]]] * 2, *more[0])
+            Q[k, m] = block_diag(*[accel**2 * settings.accel_time * axis] * 2, *more[1])
+        H[k, ..., 0, 0] = H[k, ..., 1, 2] = 1.0
+        if offset:
+            H[k, ..., 4:6] = (system[k] == late) * np.eye(2)
+        if clock:
+            H[k, ..., -1] = (system[k] == late) * velocity[k]
     mean, cov = np.zeros(n), np.zeros((n, n))
     mean[[0, 2]] = settings.region_mean
     cov[np.ix_([0, 2], [0, 2])] = settings.region_cov
     cov[1, 1] = cov[3, 3] = settings.speed_sigma**2
-    if n == 6:
-        cov[4:, 4:] = settings.offset_cov
-    law = np.array([settings.sojourn]).ravel() / np.sum(settings.sojourn)
+    if offset:
+        cov[4:6, 4:6] = settings.offset_cov
+    if clock:
+        cov[-1, -1] = settings.time_sigma**2
+    p, size = settings.outlier_probability, np.array([1.0, settings.outlier_factor])[: sizes[1]]
+    outlier = np.array([1 - p, p])[: sizes[1]]
+    modes = int(np.prod(sizes))
     return FlatModel(
         z=z,
-        F=F,
-        Q=Q,
-        H=H,
-        R=np.repeat(R[:, None], n_modes, axis=1),
-        b=np.zeros((len(dt), n_modes, n)),
-        d=np.zeros((len(dt), n_modes, 2)),
-        trans=np.array([expm(rates * d) for d in dt]),
-        mean0=np.repeat(mean[None], n_modes, axis=0),
-        cov0=np.repeat(cov[None], n_modes, axis=0),
-        probs0=law,
+        F=F.reshape(len(dt), modes, n, n),
+        Q=Q.reshape(len(dt), modes, n, n),
+        H=H.reshape(len(dt), modes, 2, n),
+        R=np.tile(R[:, None, None] * size[:, None, None] ** 2, (1, sizes[0], 1, 1, 1)).reshape(len(dt), modes, 2, 2),
+        b=np.zeros((len(dt), modes, n)),
+        d=np.zeros((len(dt), modes, 2)),
+        trans=np.array([np.kron(expm(rates * d), np.tile(outlier, (sizes[1], 1))) for d in dt]),
+        mean0=np.repeat(mean[None], modes, axis=0),
+        cov0=np.repeat(cov[None], modes, axis=0),
+        probs0=np.kron(np.array(settings.sojourn) / np.sum(settings.sojourn), outlier),
     )
 
 
-def by_hand(settings, a, b, i, j, log_likelihood):
+def by_hand(settings, a, b, i, j, run):
     """Times and cumulative ratios from the time both tracks live, each hypothesis filtered in full."""
     system, time, z, R, begin, later = merged(a, b, i, j)
-    carries = later if np.any(settings.offset_cov) else None
-    step = log_likelihood(model(settings, time, system, z, R, carries))
+    own, velocity, wide = np.zeros(len(time)), np.zeros((len(time), 2)), R.copy()
     for s in (0, 1):
         mine = system == s
-        step[mine] -= log_likelihood(model(settings, time[mine], system[mine], z[mine], R[mine], None))
+        found = run(model(settings, time[mine], system[mine], z[mine], R[mine], None))
+        own[mine] = found.log_likelihood
+        velocity[mine] = found.mean[:, [1, 3]]
+        if s == later:
+            wide[mine] += settings.time_sigma**2 * found.cov[:, [1, 3]][:, :, [1, 3]]
+    step = run(model(settings, time, system, z, wide, later, velocity)).log_likelihood - own
     return time[time >= begin], np.cumsum(step)[time >= begin]
 
 
 def dense(f):
     args = (f.z, *(part[:, 0] for part in (f.F, f.Q, f.H, f.R, f.b, f.d)), f.mean0[0], f.cov0[0])
-    return np.diff(dense_kalman(*args)[2], prepend=0.0)
+    mean, cov, total = dense_kalman(*args)
+    return Run(None, mean, cov, np.diff(total, prepend=0.0))
 
 
 @quick
@@ -151,18 +169,33 @@ def test_offset_in_one_mode_is_a_joint_density(rng):
     np.testing.assert_allclose(found.llr[0], expected, rtol=1e-8, atol=1e-8)
 
 
-def test_many_pairs_of_several_modes_agree_with_loops(rng):
+@pytest.mark.parametrize("settings", [OFFSET, CLOCK, FAULTY], ids=["offset", "clock", "offset, clock and outliers"])
+def test_many_pairs_of_several_modes_agree_with_loops(rng, settings):
     a = tracks_of(rng, [(0.0, 60.0), (20.0, 50.0), (30.0, 31.0), (70.0, 90.0)])
     b = tracks_of(rng, [(10.0, 40.0), (0.0, 90.0), (85.0, 95.0)], every=2.5)
     pairs = [[0, 0], [0, 1], [1, 0], [1, 1], [2, 1], [3, 1], [3, 2], [0, 2]]
-    found = pair_ratios(a, b, pairs, OFFSET)
+    found = pair_ratios(a, b, pairs, settings)
     for p, (i, j) in enumerate(pairs[:-1]):
-        time, expected = by_hand(OFFSET, a, b, i, j, lambda f: textbook_imm(f).log_likelihood)
+        time, expected = by_hand(settings, a, b, i, j, textbook_imm)
         n = found.count[p]
         np.testing.assert_array_equal(found.time[p, :n], time)
         np.testing.assert_allclose(found.llr[p, :n], expected, rtol=1e-8, atol=1e-8)
         assert np.isnan(found.llr[p, n:]).all() and np.isnan(found.time[p, n:]).all()
     assert found.count[-1] == 0, "these two never lived together"
+
+
+def test_a_late_transponder_is_no_other_object(rng):
+    """Positions that are 0.8 s old, 120 m behind at 150 m/s: one object if clocks may differ, two if not."""
+    time = np.arange(0.0, 60.0, 2.0)
+    rows = []
+    for late, sd in ((0.0, 20.0), (0.8, 15.0)):
+        z = np.outer(time - late, [150.0, 0.0]) + sd * rng.normal(size=(30, 2))
+        rows.append(LocalTracks(np.zeros(30, int), time, z, np.tile(sd**2 * np.eye(2), (30, 1, 1))))
+    told = [
+        pair_ratios(*rows, [[0, 0]], PairSettings(accel=(0.3,), sojourn=(1.0,), time_sigma=sigma)).llr[0, -1]
+        for sigma in (0.0, 1.0)
+    ]
+    assert told[0] < -20.0 and told[1] > 5.0
 
 
 def test_a_region_of_a_hundred_kilometres_costs_no_digits(rng):
@@ -265,6 +298,9 @@ def test_what_is_no_input_is_refused(rng):
         {"region_cov": np.zeros((2, 2))},
         {"offset_cov": np.eye(3)},
         {"offset_time": 0.0},
+        {"time_sigma": -1.0},
+        {"outlier_probability": 1.0},
+        {"outlier_factor": 0.5},
         {"region_mean": (0.0,)},
         {"sojourn": (1.0, -1.0)},
     ):

@@ -6,12 +6,23 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from saltus.filters.estimates import Estimates
 from saltus.filters.imm import imm_filter
 from saltus.identify.local import PairSettings
 from saltus.linalg import block_diagonal
 from saltus.models.checks import FloatArray
 
-__all__ = ["Index", "Lanes", "Start", "batches", "flatten", "joint_log_likelihood", "own_filters", "region_start"]
+__all__ = [
+    "Index",
+    "Lanes",
+    "Own",
+    "Start",
+    "batches",
+    "flatten",
+    "joint_log_likelihood",
+    "own_filters",
+    "region_start",
+]
 
 Index = npt.NDArray[np.int64]
 
@@ -33,7 +44,16 @@ class Lanes(NamedTuple):
     time: FloatArray  # (L, T) s
     z: FloatArray  # (L, T, 2) m
     R: FloatArray  # (L, T, 2, 2) m^2
-    offset: npt.NDArray[np.bool_]  # (L, T): the row's system carries the relative offset
+    differs: FloatArray  # (L, T, 2, D): what the lasting differences of systems (D of them) add to the row
+
+
+class Own(NamedTuple):
+    """What own filters said of their tracks."""
+
+    log_likelihood: FloatArray  # (L, T)
+    velocity: FloatArray  # (L, T, 2) after each row, m/s
+    spread: FloatArray  # (L, T, 2, 2) its covariance
+    beliefs: tuple[FloatArray, FloatArray, FloatArray]  # (W, M), (W, M, 4), (W, M, 4, 4) after the wanted rows
 
 
 def flatten(first: Index, count: Index) -> tuple[Index, Index]:
@@ -69,68 +89,89 @@ def region_start(settings: PairSettings, time: FloatArray) -> Start:
     )
 
 
-def own_filters(
-    lanes: Lanes, settings: PairSettings, wanted: tuple[Index, Index]
-) -> tuple[FloatArray, tuple[FloatArray, FloatArray, FloatArray]]:
+def own_filters(lanes: Lanes, settings: PairSettings, wanted: tuple[Index, Index]) -> Own:
     """Filter tracks, each by itself from the region.
 
     Args:
         lanes: one track each.
         settings: objects.
         wanted: lane and row (W,), (W,) of the beliefs to return.
-
-    Returns:
-        Log-likelihood of every row (L, T), and probs (W, M), means (W, M, 4), covs (W, M, 4, 4) after the wanted rows.
     """
     start = region_start(settings, lanes.time[:, 0])
-    F, Q, trans = _matrices(lanes.time, start.time, settings, 4)
-    found = imm_filter(
-        lanes.z,
-        F=F,
-        Q=Q,
-        H=_position(4),
-        R=lanes.R[:, :, None],
-        trans=[trans],
-        mean0=start.mean,
-        cov0=start.cov,
-        probs0=start.probs,
-        per_mode=len(wanted[0]) > 0,
-        keep="all" if len(wanted[0]) else "last",
-    )
-    if found.mode_means is None or found.mode_covs is None:
-        m = len(settings.accel)
-        return found.log_likelihood, (np.zeros((0, m)), np.zeros((0, m, 4)), np.zeros((0, m, 4, 4)))
-    return found.log_likelihood, (found.probs[wanted], found.mode_means[wanted], found.mode_covs[wanted])
+    matrices = _matrices(lanes.time, start.time, settings, 4)
+    moving = settings.time_sigma > 0
+    every, H = len(wanted[0]) > 0, np.eye(4)[None, 0::2]
+    found = _filtered(lanes, matrices, H, (start.probs, start.mean, start.cov), settings, every, every or moving)
+    shape, m = lanes.time.shape, len(settings.accel)
+    velocity, spread = np.zeros((*shape, 2)), np.zeros((*shape, 2, 2))
+    if moving:
+        velocity, spread = found.mean[..., 1::2], found.cov[..., 1::2, 1::2]
+    beliefs = (np.zeros((0, m)), np.zeros((0, m, 4)), np.zeros((0, m, 4, 4)))
+    if found.mode_means is not None and found.mode_covs is not None:
+        beliefs = (found.probs[wanted], found.mode_means[wanted], found.mode_covs[wanted])
+        if settings.outlier_probability > 0:
+            beliefs = _merged_outliers(*beliefs)
+    return Own(found.log_likelihood, velocity, spread, beliefs)
 
 
 def joint_log_likelihood(lanes: Lanes, start: Start, settings: PairSettings) -> FloatArray:
     """Return the log-likelihood of every row (L, T) where both systems see one object.
 
-    z = position + v, or position + o + v in the rows that carry the offset o ~ N(0, offset_cov): two more states,
-    do = -o / offset_time dt + noise that keeps the covariance.
+    z = position + D (o, tau) + v, with the lasting differences o ~ N(0, offset_cov) and tau ~ N(0, time_sigma^2) as
+    more states: do = -o / offset_time dt + noise that keeps the covariance, tau constant.
     """
-    offset = np.asarray(settings.offset_cov)
-    F, Q, trans = _matrices(lanes.time, start.time, settings, 6 if offset.any() else 4)
-    H, mean, cov = _position(4), start.mean, start.cov
-    if offset.any():
-        mean = np.concatenate([mean, np.zeros((*mean.shape[:-1], 2))], axis=-1)
-        cov = block_diagonal(cov, offset)
-        H = np.zeros((*lanes.offset.shape, 1, 2, 6))
-        H[..., 0, 0] = H[..., 1, 2] = 1.0
-        H[..., 0, 4] = H[..., 1, 5] = lanes.offset[..., None]
-    found = imm_filter(
+    differences = settings.differences()
+    n = 4 + len(differences)
+    matrices = _matrices(lanes.time, start.time, settings, n)
+    if n == 4:
+        return _filtered(lanes, matrices, np.eye(4)[None, 0::2], start[1:], settings, False, False).log_likelihood
+    H = np.zeros((*lanes.time.shape, 1, 2, n))
+    H[..., 0, 0] = H[..., 1, 2] = 1.0
+    H[..., 4:] = lanes.differs[..., None, :, :]
+    mean = np.concatenate([start.mean, np.zeros((*start.mean.shape[:-1], n - 4))], axis=-1)
+    prior = (start.probs, mean, block_diagonal(start.cov, differences))
+    return _filtered(lanes, matrices, H, prior, settings, False, False).log_likelihood
+
+
+def _filtered(
+    lanes: Lanes,
+    matrices: tuple[FloatArray, FloatArray, FloatArray],
+    H: FloatArray,
+    prior: tuple[FloatArray, FloatArray, FloatArray],
+    settings: PairSettings,
+    per_mode: bool,
+    every: bool,
+) -> Estimates:
+    """Run the kernel, with a chain without memory for outliers where there are any."""
+    (F, Q, trans), (probs, mean, cov) = matrices, prior
+    R, chains, p = lanes.R[:, :, None], [trans], settings.outlier_probability
+    if p > 0:
+        chains.append(np.array([[1.0 - p, p]] * 2))
+        F, Q, H, cov = (np.expand_dims(a, -3) for a in (F, Q, H, cov))
+        mean, probs = np.expand_dims(mean, -2), probs[..., None] * np.array([1.0 - p, p])
+        R = np.stack([R, settings.outlier_factor**2 * R], axis=-3)
+    return imm_filter(
         lanes.z,
         F=F,
         Q=Q,
         H=H,
-        R=lanes.R[:, :, None],
-        trans=[trans],
+        R=R,
+        trans=chains,
         mean0=mean,
         cov0=cov,
-        probs0=start.probs,
-        keep="last",
+        probs0=probs,
+        per_mode=per_mode,
+        keep="all" if every else "last",
     )
-    return found.log_likelihood
+
+
+def _merged_outliers(probs: FloatArray, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Forget whether the last row was an outlier: the mixture of each mode (W, M, 2) by its moments, as mixing does."""
+    weight = (probs + 1e-290) / (probs + 1e-290).sum(-1, keepdims=True)
+    middle = (weight[..., None] * mean).sum(-2)
+    off = mean - middle[..., None, :]
+    spread = (weight[..., None, None] * (cov + off[..., :, None] * off[..., None, :])).sum(-3)
+    return probs.sum(-1), middle, spread
 
 
 def _matrices(
@@ -150,14 +191,9 @@ def _matrices(
         F[..., x, v] = t
         Q[..., x, x], Q[..., x, v], Q[..., v, x], Q[..., v, v] = corner, side, side, end
     if n > 4:
+        F[..., range(4, n), range(4, n)] = 1.0
+    if n > 5 and np.isfinite(settings.offset_time):
         kept = np.exp(-t / settings.offset_time)
         F[..., 4, 4] = F[..., 5, 5] = kept
-        if np.isfinite(settings.offset_time):
-            Q[..., 4:, 4:] = (1.0 - kept**2)[..., None, None] * np.asarray(settings.offset_cov)
+        Q[..., 4:6, 4:6] = (1.0 - kept**2)[..., None, None] * settings.offset_cov
     return F, Q, chain.transition(dt)
-
-
-def _position(n: int) -> FloatArray:
-    H = np.zeros((1, 2, n))
-    H[0, 0, 0] = H[0, 1, 2] = 1.0
-    return H

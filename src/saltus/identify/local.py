@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from saltus.errors import DataError, ModelError
+from saltus.linalg import block_diagonal
 from saltus.models import Chain
 from saltus.models.checks import FloatArray, covariance, numbers, same
 
@@ -36,6 +37,10 @@ class PairSettings:
         accel_time: s that an acceleration lasts: the spectral density is accel^2 accel_time.
         offset_cov: covariance of the constant offset left between the systems, (2, 2), m^2; zeros: none.
         offset_time: correlation time of that offset, s; inf: it is constant.
+        time_sigma: standard deviation of an object's constant difference of clocks between the systems, s: on-board
+            latency displaces it along its course.
+        outlier_probability: of a measurement whose error is `outlier_factor` times as large; 0: there are none.
+        outlier_factor: see there.
         region_mean: centre of the region under surveillance, (2,), m.
         region_cov: covariance of an object's position in it before it is seen, (2, 2), m^2.
         speed_sigma: standard deviation of each component of an object's velocity, m/s.
@@ -49,6 +54,9 @@ class PairSettings:
     accel_time: float = 4.0
     offset_cov: FloatArray | Sequence[Sequence[float]] = field(default_factory=lambda: np.zeros((2, 2)))
     offset_time: float = np.inf
+    time_sigma: float = 0.0
+    outlier_probability: float = 0.0
+    outlier_factor: float = 10.0
     region_mean: FloatArray | Sequence[float] = (0.0, 0.0)
     region_cov: FloatArray | Sequence[Sequence[float]] = field(default_factory=lambda: 1e10 * np.eye(2))
     speed_sigma: float = 100.0
@@ -69,6 +77,13 @@ class PairSettings:
         for name in ("accel_time", "speed_sigma"):
             if not 0 < getattr(self, name) < np.inf:
                 raise ModelError(f"PairSettings.{name} must be positive and finite, got {getattr(self, name)}.")
+        if not (
+            0 <= self.time_sigma < np.inf and 0 <= self.outlier_probability < 1 and 1 <= self.outlier_factor < np.inf
+        ):
+            raise ModelError(
+                f"PairSettings: time_sigma must not be negative, outlier_probability lie in [0, 1) and outlier_factor "
+                f"be at least 1; got {self.time_sigma}, {self.outlier_probability} and {self.outlier_factor}."
+            )
         if not self.offset_time > 0:
             raise ModelError(f"PairSettings.offset_time must be positive or inf, got {self.offset_time}.")
         for name in ("offset_cov", "region_cov"):
@@ -88,8 +103,9 @@ class PairSettings:
 
     def __hash__(self) -> int:
         arrays = (self.offset_cov, self.region_mean, self.region_cov)
-        plain = (self.accel, self.sojourn, self.accel_time, self.offset_time, self.speed_sigma)
-        return hash((*plain, *(np.asarray(a).tobytes() for a in arrays)))
+        plain = (self.accel, self.sojourn, self.accel_time, self.offset_time, self.time_sigma, self.speed_sigma)
+        outliers = (self.outlier_probability, self.outlier_factor)
+        return hash((*plain, *outliers, *(np.asarray(a).tobytes() for a in arrays)))
 
     def densities(self) -> FloatArray:
         """Return the spectral density of acceleration in each mode, (M,), m^2/s^3."""
@@ -101,6 +117,13 @@ class PairSettings:
         if len(labels) == 1:
             return Chain("manoeuvre", labels, trans=[[1.0]])
         return Chain("manoeuvre", labels, sojourn=dict(zip(labels, self.sojourn, strict=True)))
+
+    def differences(self) -> FloatArray:
+        """Return the covariance of the lasting differences between systems: the offset, then the clock, where any."""
+        parts = [np.asarray(self.offset_cov)] if np.any(self.offset_cov) else []
+        if self.time_sigma > 0:
+            parts.append(np.array([[self.time_sigma**2]]))
+        return block_diagonal(*parts) if parts else np.zeros((0, 0))
 
     def prior(self) -> tuple[FloatArray, FloatArray]:
         """Return mean (4,) and covariance (4, 4) of (x, vx, y, vy) at an object's first measurement."""

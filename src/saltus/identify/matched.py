@@ -62,18 +62,19 @@ class PairDraws(NamedTuple):
 
 
 def same_pairs(schedule: Schedule, settings: PairSettings, draws: int, rng: np.random.Generator) -> PairDraws:
-    """Draw pairs of tracks of one object: the later system carries the offset."""
+    """Draw pairs of tracks of one object: the later system carries offset and clock."""
     times, _, later = _opened(schedule)
-    position = _walk(_somewhere(settings, draws, rng), times, settings, rng)[..., 0]
+    states = _walk(_somewhere(settings, draws, rng), times, settings, rng)
     root = _root(np.asarray(settings.offset_cov))
     offset = rng.standard_normal((draws, 2)) @ root.T
-    moved = np.zeros((draws, len(times), 2))
+    clock = settings.time_sigma * rng.standard_normal((draws, 1, 1))
+    moved = states[..., 0] + clock * states[..., 1]
     for k, dt in enumerate(np.diff(times, prepend=times[0])):
         kept = np.exp(-dt / settings.offset_time)
         offset = kept * offset + np.sqrt(1.0 - kept**2) * (rng.standard_normal((draws, 2)) @ root.T)
-        moved[:, k] = offset
-    seen = [position + moved if s == later else position for s in (0, 1)]
-    return _measured(schedule, seen, np.ones(draws), rng, np.zeros((draws, 4)))
+        moved[:, k] += offset
+    seen = [moved if s == later else states[..., 0] for s in (0, 1)]
+    return _measured(schedule, seen, settings, np.ones(draws), rng, np.zeros((draws, 4)))
 
 
 def different_pairs(
@@ -101,7 +102,7 @@ def different_pairs(
     late = np.full_like(early, np.nan)
     late[:, at:] = _walk(start.reshape(draws, 2, 2), times[at:], settings, rng)
     seen = [(late if s == later else early)[..., 0] for s in (0, 1)]
-    return _measured(schedule, seen, weight, rng, start - centre)
+    return _measured(schedule, seen, settings, weight, rng, start - centre)
 
 
 def wide_spreads(schedule: Schedule, settings: PairSettings) -> Float[np.ndarray, "c 4 4"]:
@@ -167,7 +168,12 @@ def _log_normal(off: FloatArray, cov: FloatArray) -> FloatArray:
 
 
 def _measured(
-    schedule: Schedule, seen: Sequence[FloatArray], weight: FloatArray, rng: np.random.Generator, apart: FloatArray
+    schedule: Schedule,
+    seen: Sequence[FloatArray],
+    settings: PairSettings,
+    weight: FloatArray,
+    rng: np.random.Generator,
+    apart: FloatArray,
 ) -> PairDraws:
     """Add noise to the positions (D, K, 2) that each system sees, and keep its rows."""
     system, times, D = np.array(schedule.system), np.array(schedule.times), len(weight)
@@ -175,7 +181,9 @@ def _measured(
     for s, position in enumerate(seen):
         rows: Index = np.flatnonzero(system == s)
         R = np.array(schedule.R[s])
-        z = position[:, rows] + rng.standard_normal((D, len(rows), 2)) @ _root(R).T
+        faulty = rng.random((D, len(rows), 1)) < settings.outlier_probability
+        size = np.where(faulty, settings.outlier_factor, 1.0)
+        z = position[:, rows] + size * (rng.standard_normal((D, len(rows), 2)) @ _root(R).T)
         track = np.repeat(np.arange(D), len(rows))
         R = np.broadcast_to(R, (len(track), 2, 2))
         tracks.append(LocalTracks(track, np.tile(times[rows], D), z.reshape(-1, 2), R))

@@ -48,6 +48,15 @@ class _Rows(NamedTuple):
     earlier: tuple[Index, Index]  # row before them, -1 where the track has none: at most one of both is not
 
 
+class _Own(NamedTuple):
+    """What own filters said of every row of a system (N rows), and the beliefs that pairs start from."""
+
+    log_likelihood: FloatArray  # (N,)
+    velocity: FloatArray  # (N, 2), 0 where no clocks differ
+    spread: FloatArray  # (N, 2, 2)
+    start: Start  # (P, ...)
+
+
 def pair_ratios(
     a: LocalTracks,
     b: LocalTracks,
@@ -62,7 +71,8 @@ def pair_ratios(
 
     Both hypotheses begin with an object somewhere in the region, at the first measurement of its track. Before the
     later track begins the ratio is 0, because one object or two explain one track alike; it ends when one of the
-    tracks does. Under "one object" the later track carries the offset between systems. A value uses no later row.
+    tracks does. Under "one object" the later track carries the offset and the difference of clocks. A value uses no
+    later row.
 
     Args:
         a: tracks of one system.
@@ -78,19 +88,21 @@ def pair_ratios(
     spans_a, spans_b = spans(a, "a"), spans(b, "b")
     chosen = _pairs(pairs, len(spans_a.first), len(spans_b.first))
     rows = _common(a, b, spans_a, spans_b, chosen)
-    (own_a, start_a), (own_b, start_b) = (
+    own_a, own_b = (
         _own(tracks, span, settings, earlier)
         for tracks, span, earlier in ((a, spans_a, rows.earlier[0]), (b, spans_b, rows.earlier[1]))
     )
-    both, own = LocalTracks(*(np.concatenate(part) for part in zip(a, b, strict=True))), np.concatenate([own_a, own_b])
+    both = LocalTracks(*(np.concatenate(part) for part in zip(a, b, strict=True)))
+    alone, velocity, spread = (np.concatenate(part) for part in zip(own_a[:3], own_b[:3], strict=True))
     count = rows.length[0] + rows.length[1]
     time, llr = np.full((2, len(chosen), int(count.max(initial=0))), np.nan)
-    for lanes in batches(count, 6 if np.any(settings.offset_cov) else 4, len(settings.accel)):
+    for lanes in batches(count, 4 + len(settings.differences()), _modes(settings)):
         at, row, late = _merged(both, rows, lanes, len(a.time))
-        merged = _filled(count[lanes], at, both, row, late)
-        start = _started(merged.time[:, 0], lanes, rows, (start_a, start_b), settings)
+        merged = _filled(count[lanes], at, both, row)
+        merged = _with_differences(merged, at, late, velocity[row], spread[row], settings)
+        start = _started(merged.time[:, 0], lanes, rows, (own_a.start, own_b.start), settings)
         step = joint_log_likelihood(merged, start, settings)
-        step[at] -= own[row]
+        step[at] -= alone[row]
         place = (lanes[at[0]], at[1])
         time[place], llr[place] = both.time[row], np.cumsum(step, axis=1)[at]
     if log_prior_identity is not None:
@@ -130,30 +142,32 @@ def _find(tracks: LocalTracks, which: Index, time: FloatArray, side: str) -> Ind
     return np.asarray(np.searchsorted(axis, at, side="left" if side == "left" else "right"))
 
 
-def _own(tracks: LocalTracks, span: Spans, settings: PairSettings, wanted: Index) -> tuple[FloatArray, Start]:
-    """Log-likelihood of every row in its own filter (N,), and the beliefs after the wanted rows (P,), -1 for none."""
-    length, modes = span.stop - span.first, len(settings.accel)
-    log_likelihood = np.zeros(len(tracks.time))
+def _modes(settings: PairSettings) -> int:
+    return len(settings.accel) * (2 if settings.outlier_probability > 0 else 1)
+
+
+def _own(tracks: LocalTracks, span: Spans, settings: PairSettings, wanted: Index) -> _Own:
+    """Filter every track by itself; beliefs are those after the wanted rows (P,), -1 for none."""
+    length, n, modes = span.stop - span.first, len(tracks.time), len(settings.accel)
     start = Start(np.zeros(len(wanted)), *(np.zeros((len(wanted), modes, *shape)) for shape in ((), (4,), (4, 4))))
+    out = _Own(np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2, 2)), start)
     asked = np.flatnonzero(wanted >= 0)
     track = tracks.track[wanted[asked]]
     start.time[asked] = tracks.time[wanted[asked]]
-    for lanes in batches(length, 4, modes):
+    for lanes in batches(length, 4, _modes(settings)):
         lane, row = flatten(span.first[lanes], length[lanes])
         at = (lane, row - span.first[lanes][lane])
         where = np.full(len(length), -1)
         where[lanes] = np.arange(len(lanes))
         mine = asked[where[track] >= 0]
         of = tracks.track[wanted[mine]]
-        found, belief = own_filters(
-            _filled(length[lanes], at, tracks, row, np.zeros(len(row), bool)),
-            settings,
-            (where[of], wanted[mine] - span.first[of]),
-        )
-        log_likelihood[row] = found[at]
-        for store, values in zip(start[1:], belief, strict=True):
+        after = (where[of], wanted[mine] - span.first[of])
+        found = own_filters(_filled(length[lanes], at, tracks, row), settings, after)
+        for store, values in zip(out[:3], found[:3], strict=True):
+            store[row] = values[at]
+        for store, values in zip(start[1:], found.beliefs, strict=True):
             store[mine] = values
-    return log_likelihood, start
+    return out
 
 
 def _merged(
@@ -174,19 +188,39 @@ def _merged(
     return at, row, (row < n_a) == a_is_later[lane]
 
 
-def _filled(
-    length: Index, at: tuple[Index, Index], tracks: LocalTracks, row: Index, offset: npt.NDArray[np.bool_]
-) -> Lanes:
+def _filled(length: Index, at: tuple[Index, Index], tracks: LocalTracks, row: Index) -> Lanes:
     """Put rows in their places and fill up: NaN at the last time, an interval of 0 with a covariance of 1."""
     shape = (len(length), int(length.max()))
     out = Lanes(
         np.full(shape, -np.inf),
         np.full((*shape, 2), np.nan),
         np.broadcast_to(np.eye(2), (*shape, 2, 2)).copy(),
-        np.zeros(shape, bool),
+        np.zeros((*shape, 2, 0)),
     )
-    out.time[at], out.z[at], out.R[at], out.offset[at] = tracks.time[row], tracks.z[row], tracks.R[row], offset
+    out.time[at], out.z[at], out.R[at] = tracks.time[row], tracks.z[row], tracks.R[row]
     return out._replace(time=np.maximum.accumulate(out.time, axis=1))
+
+
+def _with_differences(
+    lanes: Lanes,
+    at: tuple[Index, Index],
+    late: npt.NDArray[np.bool_],
+    velocity: FloatArray,
+    spread: FloatArray,
+    settings: PairSettings,
+) -> Lanes:
+    """Let late rows differ by an offset, and by a clock times their velocity; what that is uncertain by is noise."""
+    parts = []
+    if np.any(settings.offset_cov):
+        parts.append(late[:, None, None] * np.eye(2))
+    if settings.time_sigma > 0:
+        parts.append(late[:, None, None] * velocity[:, :, None])
+        lanes.R[at] += settings.time_sigma**2 * late[:, None, None] * spread
+    if not parts:
+        return lanes
+    differs = np.zeros((*lanes.time.shape, 2, len(settings.differences())))
+    differs[at] = np.concatenate(parts, axis=-1)
+    return lanes._replace(differs=differs)
 
 
 def _started(begin: FloatArray, lanes: Index, rows: _Rows, own: tuple[Start, Start], settings: PairSettings) -> Start:
