@@ -97,16 +97,42 @@ def score(output: Path, truth: Path, json_path: Path | None, cutoff: float) -> N
 
 @main.command()
 @click.argument("name")
+@click.argument("recordings", nargs=-1, type=_FILE)
 @click.option("-o", "--output", required=True, type=_FILE, help="Output directory.")
+@click.option("--config", type=_FILE, help="Of recordings: TOML file with date, [[sensor]] sites, tracker settings.")
+@click.option("--date", help="Of recordings: date, YYYY-MM-DD.")
+@click.option("--reference", type=_FILE, help="Of recordings: Parquet of the same plots with BDS 5,0.")
 @click.option("--runs", type=click.IntRange(min=2), help="Monte-Carlo runs (default: the study's own).")
 @click.option("--seed", type=int, default=0, show_default=True)
-def study(name: str, output: Path, runs: int | None, seed: int) -> None:
-    """Run the study NAME (coloured, fusion, identification, jamming or radar): metrics.json and pictures in OUTPUT."""
-    from saltus.progress import progress_bar
-    from saltus.studies import run_study
+def study(
+    name: str,
+    recordings: tuple[Path, ...],
+    output: Path,
+    config: Path | None,
+    date: str | None,
+    reference: Path | None,
+    runs: int | None,
+    seed: int,
+) -> None:
+    """Run the study NAME: metrics.json and pictures in OUTPUT.
 
-    with progress_bar() as bar:
-        run_study(name, output, runs, seed, progress=lambda done, all_runs: bar.working(name, done / all_runs))
+    NAME is coloured, faults, fusion, identification, jamming or radar. The study faults puts faults into the plots of
+    RECORDINGS, or of a simulated scene where none is named; the others simulate alone.
+    """
+    if name == "faults":
+        if runs is not None:
+            raise click.UsageError("the study faults tracks its recording; it has no --runs. Vary --seed.")
+        from saltus.injection import study_faults
+
+        study_faults(recordings, output, config, date, reference, seed)
+    elif recordings or config or date or reference:
+        raise click.UsageError(f"the study {name} simulates: it takes no recording. The study faults does.")
+    else:
+        from saltus.progress import progress_bar
+        from saltus.studies import run_study
+
+        with progress_bar() as bar:
+            run_study(name, output, runs, seed, progress=lambda done, all_runs: bar.working(name, done / all_runs))
     click.echo(f"written to {output}/")
 
 

@@ -28,7 +28,7 @@ from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.settings import TrackerSettings
 from saltus.tracks.tracker import Assignments, Rows, Tracker, join_rows
 
-__all__ = ["track_files"]
+__all__ = ["track_files", "track_recording"]
 
 _Array = npt.NDArray[np.float64]
 
@@ -102,6 +102,26 @@ def track_files(
             )
     show_summary(summary, output, report)
     return summary
+
+
+def track_recording(
+    recording: Recording, config: Config, bar: Progress | None = None
+) -> tuple[Plots, pa.Table, pa.Table]:
+    """Track a recording in memory as `track_files` does, identities used.
+
+    Args:
+        recording: as read, or changed since.
+        config: sites, noise and settings.
+        bar: where to show progress.
+
+    Returns:
+        The reports with the reasons why some are not used; the columns of `tracks.parquet`; those of
+        `assignments.parquet`, one row for each report in the same order.
+    """
+    plots, sensors, _ = _prepare(recording, config, None, None)
+    tracked = _track(plots, sensors, config, True, bar or Progress())
+    tracks, _ = _tables(tracked, plots, config)
+    return plots, tracks, assignment_table(plots, tracked.measurements, tracked.assignments)
 
 
 def parse_time(text: str, start: float) -> float:

@@ -42,7 +42,7 @@ def test_a_fault_widens_what_it_makes_wrong(rng):
     found = law.covariances(replace(m, cov=cov), np.arange(7))
     wrong = (
         (np.radians(SETTINGS.outlier_azimuth) * distance) ** 2,
-        np.minimum(SETTINGS.outlier_range, 0.03 * distance) ** 2,
+        np.minimum(SETTINGS.outlier_range, 0.1 * distance) ** 2,
     )
     for h, (condition, fault) in enumerate(zip(law.condition, law.fault, strict=True)):
         worse = np.where(law.degraded[condition], 16.0, 1.0)

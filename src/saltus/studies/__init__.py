@@ -34,6 +34,8 @@ STUDIES: dict[str, Study] = {
     "radar": radar_study,
 }
 
+_OF_RECORDINGS = ("faults",)  # in saltus.injection
+
 
 def run_study(
     name: str,
@@ -57,7 +59,7 @@ def run_study(
         DataError: `output` exists and is not a directory.
     """
     if name not in STUDIES:
-        raise ModelError(f"no study named {name!r}; the studies are: {', '.join(sorted(STUDIES))}.")
+        raise ModelError(f"no study named {name!r}; the studies are: {', '.join(sorted([*STUDIES, *_OF_RECORDINGS]))}.")
     if (runs is not None and runs < 2) or seed < 0:
         raise ModelError(f"need runs >= 2 (intervals come from the runs' spread) and seed >= 0: {runs}, {seed}.")
     with output_directory(output) as folder:

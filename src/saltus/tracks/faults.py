@@ -22,7 +22,7 @@ __all__ = ["History", "PlotLaw", "SourceCondition", "plot_law"]
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
-_FAULTY_SHARE = 0.03  # of the range: faults scale with what a radar covers
+_FAULTY_SHARE = 0.1  # of the range: faults scale with what a radar covers
 _LIVE = 0.01  # probability of a condition from which gates reckon with it
 
 
@@ -43,8 +43,8 @@ class PlotLaw:
 
         R + sum_a e_a B_a over the components a: e_a = (growth - 1) v_a where the source is degraded in a, plus
         outlier_a^2 where the plot is wrong in it. Of a radar B = c c', u u' with u the unit vector from the site and c
-        the one across it, v = c'R c, u'R u; a fault of azimuth counts times the ground range, one of range is cut to
-        3 % of it. Else B = I and v the mean of the two variances.
+        the one across it, v = c'R c, u'R u; a fault of azimuth counts times the ground range, one of range is cut to a
+        tenth of it. Else B = I and v the mean of the two variances.
         """
         h = np.arange(len(self.fault)) if which is None else which
         R = m.cov[index]

@@ -72,8 +72,15 @@ class Lifecycle:
         self.has_altitude[rows] = False
         self.icao24[rows] = self.mode3a[rows] = self.named[rows] = NO_CODE
 
-    def hit(self, rows: _Rows, time: _Array, period: _Array, plot: npt.NDArray[np.intp]) -> None:
-        """Enter a plot for each row; confirm what has M plots of the last N expected."""
+    def hit(
+        self,
+        rows: _Rows,
+        time: _Array,
+        period: _Array,
+        plot: npt.NDArray[np.intp],
+        sound: npt.NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Enter a plot for each row; confirm what has M plots of the last N expected, if this one is sound."""
         settings = self._settings
         self.period[rows] = np.minimum(self.period[rows], period)
         scans = np.rint((time - self.located[rows]) / self.period[rows])
@@ -81,7 +88,7 @@ class Lifecycle:
         self.history[rows] = (self.history[rows] << shift) | np.uint64(1)
         window = np.uint64((1 << settings.confirm_scans) - 1)
         hits = np.bitwise_count(self.history[rows] & window)
-        enough = hits >= settings.confirm_hits
+        enough = (hits >= settings.confirm_hits) & (True if sound is None else sound)
         self.status[rows] = np.where(enough | (self.status[rows] == CONFIRMED), CONFIRMED, TENTATIVE)
         self.time[rows] = np.maximum(self.time[rows], time)
         self.located[rows] = np.maximum(self.located[rows], time)

@@ -81,7 +81,7 @@ class TrackerSettings:
             sensor, each plot by itself; 0 = none is. A plot outside the gate of a confirmed track, or of one of its
             own address, may still be taken for such a fault, with the deviations below.
         outlier_azimuth: standard deviation of a faulty azimuth, degrees.
-        outlier_range: standard deviation of a faulty range, m, but no more than 3 % of the range.
+        outlier_range: standard deviation of a faulty range, m, but no more than a tenth of the range.
         outlier_xy: standard deviation of a faulty position, each axis, m.
         degraded_noise: factor of the standard deviations of a degraded source: of azimuth or range or both, or of
             position; 1 = no source degrades.

@@ -12,7 +12,7 @@ from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.kinematics import Moments, Plan, Start, make_kinematics, two_point_start, with_speed_prior
-from saltus.tracks.lifecycle import COASTED, CONFIRMED, SEED, Birth, Lifecycle
+from saltus.tracks.lifecycle import COASTED, CONFIRMED, SEED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.sights import sight
@@ -186,20 +186,30 @@ class Tracker:
         log_f = gated.copies.score(gated.copy, gated.plan, gated.covs)
         chosen = assign(gated.pairs, self._gain(gated, index, logsumexp(source.weights(prior) + log_f, (1,))[:, 0]))
         rows, plots = gated.pairs.track[chosen], index[gated.pairs.plot[chosen]]
-        seed = life.status[rows] == SEED
-        self._start(rows[seed], plots[seed])
         weights = source.absorb(time, prior, log_f[chosen], life.status[rows] == CONFIRMED)
         p = _normalised(weights + log_f[chosen])
-        self._update(rows[~seed], gated, chosen[~seed], weights[~seed], p[~seed])
-        self._enter(rows, plots, period, gated.height_used[chosen])
         wrong, fault = source.law.faulty(p)
-        life.p_fault[rows] = np.where(seed, np.nan, wrong)
+        new = self._begun(rows, plots, wrong)
+        self._start(rows[new], plots[new])
+        self._update(rows[~new], gated, chosen[~new], weights[~new], p[~new])
+        self._enter(rows, plots, period, gated.height_used[chosen], sound=new | (wrong <= 0.5))
+        life.p_fault[rows] = np.where(new, np.nan, wrong)
         # Neither a start nor a fault says whether the filter's innovations are what it thinks.
-        d2 = np.where(seed | (p @ (source.law.condition + source.law.fault > 0) > 0.5), np.nan, gated.d2[chosen])
-        self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2, np.where(seed, 0, fault))
+        d2 = np.where(new | (p @ (source.law.condition + source.law.fault > 0) > 0.5), np.nan, gated.d2[chosen])
+        self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2, np.where(new, 0, fault))
         left = np.ones(len(index), bool)
         left[gated.pairs.plot[chosen]] = False
         self._begin(index[left], plots[life.status[rows] == CONFIRMED], period)
+
+    def _begun(self, rows: _Index, plots: _Index, wrong: _Array) -> npt.NDArray[np.bool_]:
+        """Say which tracks begin with this plot and the one before.
+
+        They are those of one plot, and tentative ones with two faulty plots in a row: likelier than that is one faulty
+        plot among the two they began with.
+        """
+        life = self._life
+        twice = (life.status[rows] == TENTATIVE) & (wrong > 0.5) & (life.p_fault[rows] > 0.5)
+        return np.asarray((life.status[rows] == SEED) | (twice & (self._m.time[plots] > life.time[rows])))
 
     def _update(self, rows: _Index, gated: Gated, pairs: _Index, log_weights: _Array, p: _Array) -> None:
         """Condition tracks on the plots chosen, each a mixture of what may be wrong with it.
@@ -266,11 +276,18 @@ class Tracker:
         start.cov[one_height, 4, 4], start.cov[one_height, 5, 5] = cov[:, 2, 2], _CLIMB**2
         self._kinematics.write(rows, start)
 
-    def _enter(self, rows: _Index, plots: _Index, period: float, height_used: npt.NDArray[np.bool_]) -> None:
-        """Note plots, codes and status of the rows updated."""
+    def _enter(
+        self,
+        rows: _Index,
+        plots: _Index,
+        period: float,
+        height_used: npt.NDArray[np.bool_],
+        sound: npt.NDArray[np.bool_],
+    ) -> None:
+        """Note plots, codes and status of the rows updated; what is not sound confirms no track."""
         life = self._life
         fresh = life.status[rows] != CONFIRMED
-        life.hit(rows, self._m.time[plots], np.full(len(rows), period), plots)
+        life.hit(rows, self._m.time[plots], np.full(len(rows), period), plots, sound)
         life.has_altitude[rows] |= height_used
         self._note_codes(rows, plots)
         self._track_id[plots] = life.id[rows]

@@ -1,0 +1,134 @@
+"""Where aircraft were really going when a plot was made: what they downlink, a simulation's truth, or another run."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from saltus.errors import DataError
+from saltus.records import Plots
+
+__all__ = ["Followed", "Reference", "downlinked", "followed", "from_run", "simulated"]
+
+_Array = npt.NDArray[np.float64]
+_Mask = npt.NDArray[np.bool_]
+
+KNOT = 1852.0 / 3600.0
+_STEPS = (1 / 128, 1852 / 256, 2 * np.pi / 65536)  # s, m, rad: quantisation of CAT048
+_STRAIGHT, _TURN = 3.0, 10.0  # degrees of roll
+_COLUMNS = ("time", "rho_nm", "theta_deg", "bds50_track_deg", "bds50_roll_deg", "bds50_gs_kt")
+_COVERED = 0.99  # of the radar plots that a reference must know
+
+
+class Reference(NamedTuple):
+    """True course and speed at each plot."""
+
+    name: str
+    course: _Array  # degrees, NaN unknown
+    speed: _Array  # m/s
+    straight: _Mask
+    turning: _Mask
+
+
+class Followed(NamedTuple):
+    """What the tracker said at each plot; NaN where the plot gave no row."""
+
+    track: npt.NDArray[np.int64]  # 0 none
+    course: _Array  # degrees
+    speed: _Array  # m/s
+    p_fault: _Array
+    p_manoeuvre: _Array
+    confirmed: _Mask  # whether the track was, at that plot
+
+
+def followed(plots: Plots, tracks: pa.Table, assigned: pa.Table) -> Followed:
+    """Join rows of tracks to the plots that made them, by track and time."""
+    track = assigned["track_id"].fill_null(0).to_numpy()
+    updated = tracks.filter(np.array(tracks["status"].to_pylist()) != "coasted")
+    keys = zip(updated["track_id"].to_pylist(), updated["time"].to_pylist(), strict=True)
+    row_of = {key: k for k, key in enumerate(keys)}
+    row = np.array([row_of.get(key, -1) for key in zip(track.tolist(), plots.time.tolist(), strict=True)])
+
+    def column(name: str) -> _Array:
+        values = np.append(updated[name].to_numpy(zero_copy_only=False).astype(np.float64), np.nan)
+        return np.asarray(values[row])
+
+    names = ("course_deg", "speed_mps", "p_fault", "p_manoeuvre_h")
+    confirmed = np.append(np.array(updated["status"].to_pylist()) == "confirmed", False)
+    course, speed, p_fault, p_manoeuvre = (column(name) for name in names)
+    return Followed(track, course, speed, p_fault, p_manoeuvre, confirmed[row])
+
+
+def downlinked(plots: Plots, path: Path) -> Reference:
+    """Track angle, roll and ground speed that aircraft sent with each plot (BDS 5,0), from a table of the same plots.
+
+    Straight is less than 3 degrees of roll, turning more than 10.
+
+    Args:
+        plots: reports.
+        path: Parquet with time (s, UTC), rho_nm, theta_deg, bds50_track_deg, bds50_roll_deg, bds50_gs_kt.
+
+    Raises:
+        DataError: a column is missing, or the table knows other plots.
+    """
+    table = pq.read_table(path)
+    missing = [name for name in _COLUMNS if name not in table.schema.names]
+    if missing:
+        raise DataError(f"{path}: no column {', '.join(missing)}; a reference has {', '.join(_COLUMNS)}.")
+    t, rho, theta, course, roll, knots = (np.asarray(table[n].to_numpy(), np.float64) for n in _COLUMNS)
+    row = {key: k for k, key in enumerate(_keys(t, rho * 1852.0, np.radians(theta)))}
+    usable = plots.reason == 0
+    at = np.array([row.get(key, -1) for key in _keys(plots.time, plots.range, plots.azimuth)])
+    if np.mean(at[usable] >= 0) < _COVERED:
+        raise DataError(f"{path}: only {np.mean(at[usable] >= 0):.1%} of the recording's plots are in this table.")
+    course, roll, knots = (np.where(at >= 0, values[at], np.nan) for values in (course, roll, knots))
+    known = np.isfinite(course + roll + knots)
+    bank = np.abs(np.where(known, roll, np.nan))
+    return Reference(f"BDS 5,0 in {path.name}", course, knots * KNOT, bank < _STRAIGHT, bank > _TURN)
+
+
+def _keys(time: _Array, slant: _Array, azimuth: _Array) -> list[tuple[int, ...]]:
+    """What tells plots apart in two decodings: raw time of day, range and azimuth."""
+    values = (time % 86400.0, slant, azimuth)
+    known = [np.where(np.isfinite(v), v, -1.0) for v in values]
+    raw = [np.rint(v / step).astype(np.int64) for v, step in zip(known, _STEPS, strict=True)]
+    raw[2] %= 65536
+    return list(zip(*(r.tolist() for r in raw), strict=True))
+
+
+def simulated(label: npt.NDArray[np.int64], time: _Array, truth: pa.Table) -> Reference:
+    """Course, speed and turning of simulated aircraft, interpolated between the truth's seconds.
+
+    Args:
+        label: of each plot, number of the aircraft in the order of the truth, -1 none.
+        time: of each plot, s.
+        truth: columns aircraft, time, ve, vn, turning.
+    """
+    east, north = np.full(len(label), np.nan), np.full(len(label), np.nan)
+    turning = np.zeros(len(label), bool)
+    names = np.array(truth["aircraft"].to_pylist())
+    columns = {n: truth[n].to_numpy(zero_copy_only=False).astype(np.float64) for n in ("time", "ve", "vn", "turning")}
+    for k, name in enumerate(dict.fromkeys(names.tolist())):
+        own, mine = names == name, label == k
+        at = columns["time"][own]
+        for out, column in ((east, "ve"), (north, "vn")):
+            out[mine] = np.interp(time[mine], at, columns[column][own], left=np.nan, right=np.nan)
+        turning[mine] = np.interp(time[mine], at, columns["turning"][own]) > 0.5
+    known = np.isfinite(east)
+    course = np.degrees(np.arctan2(east, north)) % 360.0
+    return Reference("the simulation's truth", course, np.hypot(east, north), known & ~turning, known & turning)
+
+
+def from_run(run: Followed) -> Reference:
+    """Take a run over clean plots for the truth: straight is where it thinks so."""
+    known = np.isfinite(run.course)
+    return Reference(
+        "the run over clean plots, faults known",
+        run.course,
+        run.speed,
+        known & (run.p_manoeuvre < 0.5),
+        known & (run.p_manoeuvre >= 0.5),
+    )
