@@ -29,6 +29,7 @@ _EXPORTS = {
     "singer": "saltus.models",
     "LinearSensor": "saltus.models",
     "ModelError": "saltus.errors",
+    "MomentFilter": "saltus.filters",
     "NumericalError": "saltus.errors",
     "SaltusError": "saltus.errors",
     "discretise": "saltus.models",

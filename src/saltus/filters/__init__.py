@@ -7,6 +7,7 @@ from saltus.filters.exact import ExactFilter, exact_filter
 from saltus.filters.grid import GridDensity, GridFilter
 from saltus.filters.histories import EXACT, GPB1, GPB2, INTERACTING, MergingRule
 from saltus.filters.imm import imm_filter
+from saltus.filters.moments import Adapt, GaussianSumFilter, MomentFilter
 from saltus.filters.rao_blackwell import particle_filter
 from saltus.filters.run import IMM, Record
 from saltus.filters.steps import Belief
@@ -17,13 +18,16 @@ __all__ = [
     "GPB2",
     "IMM",
     "INTERACTING",
+    "Adapt",
     "Bank",
     "Belief",
     "Estimates",
     "ExactFilter",
+    "GaussianSumFilter",
     "GridDensity",
     "GridFilter",
     "MergingRule",
+    "MomentFilter",
     "Record",
     "augmented_filter",
     "coloured_filter",

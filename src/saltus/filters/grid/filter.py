@@ -168,7 +168,8 @@ def _steps(given: Observation, axes: Axes) -> Iterator[_Step]:
                 "Check its unit, or give wider bounds."
             )
         p = (flat / total[:, None, None]).reshape(p.shape)
-        yield _Step(p, np.log(total) + top[:, 0, 0], nis)
+        seen = (~np.isnan(z)).any(-1)
+        yield _Step(p, np.where(seen, np.log(total) + top[:, 0, 0], 0.0), nis)
 
 
 def _propagators(rates: Generator, dts: Float[np.ndarray, " t"]) -> dict[float, Propagator]:
