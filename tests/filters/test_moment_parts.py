@@ -310,7 +310,7 @@ STATIONARY = {
 @pytest.mark.parametrize(("closure", "order"), STATIONARY)
 def test_stationary_moments_are_those_of_the_table(closure, order):
     model = case("a2")[0]
-    found = stationary_moments(model, closure=closure, order=order, nodes=40)
+    found = stationary_moments(model, closure=closure, order=order)
     got = [found.mean[0, 0], found.cov[0, 0, 0], found.mean[1, 0], found.cov[1, 0, 0]]
     # The last steps of pseudo-time move the root in the third digit.
     np.testing.assert_allclose(got, STATIONARY[closure, order], atol=6e-4 if closure != "maxent" else 5e-3)
