@@ -9,10 +9,19 @@ WHITE = [
     constant_velocity(2, accel=[0.5, 2.0], kind="white"),
     constant_acceleration(2, jerk=0.3),
     singer(2, tau=20.0, sigma=[1.0, 3.0]),
+    constant_velocity(2, accel=0.5, kind="white", turn=0.03),
+    constant_velocity(3, accel=[0.5, 0.5, 0.1], kind="white", turn=-0.2),
 ]
 
 
-@pytest.mark.parametrize("motion", WHITE, ids=lambda m: m.law)
+def assert_same_cov(actual, expected):
+    """Each entry to 1e-11 of itself, or to round-off of the two deviations where it is exactly 0."""
+    sd = np.sqrt(np.diagonal(expected, axis1=-2, axis2=-1))
+    bound = 1e-11 * np.abs(expected) + 1e-15 * sd[..., :, None] * sd[..., None, :]
+    assert (np.abs(actual - expected) <= bound).all()
+
+
+@pytest.mark.parametrize("motion", WHITE, ids=lambda m: m.law if m.turn is None else f"turn {float(m.turn)}")
 def test_closed_forms_agree_with_discretise(motion):
     dt = np.array([0.0, 1e-3, 0.1, 1.0, 4.0, 19.9, 20.1, 300.0])
     step, sde = motion.step(dt), motion.sde()
@@ -21,7 +30,7 @@ def test_closed_forms_agree_with_discretise(motion):
     assert step.F.shape == step.Q.shape == (8, n, n)
     # Entries differ by many orders of magnitude (dt^5 to dt): compare each with itself.
     np.testing.assert_allclose(step.F, Phi, rtol=1e-11, atol=1e-14)
-    np.testing.assert_allclose(step.Q, Q, rtol=1e-11)
+    assert_same_cov(step.Q, Q)
 
 
 @pytest.mark.parametrize("u", [1e-9, 1e-4, 0.1, 0.999999, 1.000001, 3.0, 60.0])
@@ -76,11 +85,11 @@ def test_acceleration_constant_within_a_scan():
     np.testing.assert_allclose(step.Q, Q)
 
 
-@pytest.mark.parametrize("motion", WHITE, ids=lambda m: m.law)
+@pytest.mark.parametrize("motion", WHITE, ids=lambda m: m.law if m.turn is None else f"turn {float(m.turn)}")
 def test_two_intervals_are_one(motion):
     F, Q, _ = motion.step(np.array([1.3, 2.9, 4.2]))
     np.testing.assert_allclose(F[2], F[1] @ F[0], rtol=1e-12, atol=1e-14)
-    np.testing.assert_allclose(Q[2], F[1] @ Q[0] @ F[1].T + Q[1], rtol=1e-11)
+    assert_same_cov(F[1] @ Q[0] @ F[1].T + Q[1], Q[2])
 
 
 def test_parameters_depend_on_chains():
@@ -101,6 +110,8 @@ def test_parameters_depend_on_chains():
         (lambda: constant_velocity(2, accel=-1.0), "accel must be not negative, got -1"),
         (lambda: constant_velocity(2, accel=[1.0, 2.0, 3.0]), r"accel must be a number or one per axis \(2,\)"),
         (lambda: constant_velocity(2, accel=1.0, kind="scan").sde(), "has no stochastic differential equation"),
+        (lambda: constant_velocity(1, accel=1.0, turn=0.1), "a turn needs a plane: dims must be 2 or more, got 1"),
+        (lambda: constant_velocity(2, accel=[1.0, 2.0], turn=0.1), "accel must be equal on the first two axes"),
         (lambda: constant_acceleration(1, jerk=np.nan), "jerk holds nan"),
         (lambda: singer(1, tau=0.0, sigma=1.0), "tau must be positive, got 0"),
         (lambda: singer(1, tau=1.0, sigma="big"), "sigma must be real numbers"),
@@ -110,6 +121,39 @@ def test_parameters_depend_on_chains():
 def test_bad_motion(build, message):
     with pytest.raises(ModelError, match=message):
         build()
+
+
+def test_a_turn_goes_to_the_right_along_a_circle():
+    # North at 10 m/s, 90 degrees to the right in 30 s: a quarter of the circle of radius v/turn about (r, 0).
+    T, turn = 30.0, np.pi / 60.0
+    radius = 10.0 / turn
+    for kind in ("scan", "white"):
+        F = constant_velocity(2, accel=1.0, kind=kind, turn=turn).step(np.asarray(T)).F
+        np.testing.assert_allclose(F @ [0.0, 0.0, 0.0, 10.0], [radius, 10.0, radius, 0.0], atol=1e-12)
+
+
+@pytest.mark.parametrize("u", [1e-8, 1e-3, 0.5, 0.999999, 1.000001, 4.0])
+def test_acceleration_constant_in_a_turn_by_quadrature(u):
+    # Impulse responses by Gauss-Legendre from F alone, which its own test checks; entries down to dt^4 u.
+    T, sigma = 4.0, 3.0
+    motion = constant_velocity(2, accel=sigma, turn=u / T)
+    nodes, weights = leggauss(30)
+    F = motion.step((nodes + 1) / 2 * T).F
+    gain = np.einsum("s,sij->ij", weights / 2 * T, F[:, :, [1, 3]])  # to accelerations along x and y
+    expected = sigma**2 * gain @ gain.T
+    np.testing.assert_allclose(motion.step(np.asarray(T)).Q, expected, rtol=1e-12, atol=1e-13 * expected.max())
+
+
+@pytest.mark.parametrize("kind", ["scan", "white"])
+def test_without_turn_it_is_constant_velocity(kind):
+    chain = Chain("way", {"straight": 0.0, "right": 0.05}, stay=0.9)
+    dt = np.array([0.0, 0.5, 4.0])
+    step = constant_velocity(3, accel=[2.0, 2.0, 1.0], kind=kind, turn=lambda way: way).bind([chain]).step(dt)
+    plain = constant_velocity(3, accel=[2.0, 2.0, 1.0], kind=kind).step(dt)
+    assert step.F.shape == step.Q.shape == (3, 2, 6, 6)
+    np.testing.assert_allclose(step.F[:, 0], plain.F, rtol=1e-14)
+    np.testing.assert_allclose(step.Q[:, 0], plain.Q, rtol=1e-14)
+    np.testing.assert_array_equal(step.Q[:, 1, 4:, :], plain.Q[:, 4:, :])  # height does not turn
 
 
 def test_negative_values_of_a_chain_are_found():

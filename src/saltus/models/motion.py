@@ -1,6 +1,7 @@
 """Motion along each axis of space, with closed forms over any interval: constant velocity, acceleration, Singer.
 
-State order: the axes one after another, per axis position, velocity (, acceleration): (x, vx, y, vy).
+Constant velocity may turn in the plane of the first two axes. State order: the axes one after another, per axis
+position, velocity (, acceleration): (x, vx, y, vy).
 """
 
 from collections.abc import Callable, Sequence
@@ -15,31 +16,37 @@ from saltus.models.chain import Chain
 from saltus.models.checks import FloatArray, intervals, numbers, same
 from saltus.models.dependence import Matrix, fixed, is_fixed, resolve
 from saltus.models.dynamics import LinearSDE, Step
+from saltus.models.turning import turning
 
 __all__ = ["Motion", "constant_acceleration", "constant_velocity", "singer"]
 
 
-def constant_velocity(dims: int, accel: Matrix, kind: Literal["scan", "white"] = "scan") -> "Motion":
+def constant_velocity(
+    dims: int, accel: Matrix, kind: Literal["scan", "white"] = "scan", *, turn: Matrix | None = None
+) -> "Motion":
     """Constant velocity, disturbed by acceleration; state (x, vx) per axis.
 
     F = [[1, dt], [0, 1]];
     "scan": Q = accel^2 g g', g = (dt^2/2, dt): acceleration constant within an interval, independent between them;
     "white": Q = accel [[dt^3/3, dt^2/2], [dt^2/2, dt]]: white acceleration, consistent over divided intervals.
+    With `turn`, the velocity turns besides, at a constant rate in the plane of the first two axes (`turning`).
 
     Args:
         dims: number of axes.
         accel: for all axes or per axis (dims,), and possibly depending on chains: "scan", standard deviation in
             m/s^2; "white", spectral density in m^2/s^3 (accel_scan^2 * scan_period matches at that period).
         kind: the law of the acceleration.
+        turn: rate of turn, rad/s, from the second axis towards the first: to the right where x is east and y north;
+            possibly depending on chains. Then the first two axes have equal acceleration.
 
     Raises:
-        ModelError: accel is negative, or does not fit the number of axes.
+        ModelError: accel is negative, or does not fit the number of axes; a turn without a plane to turn in.
 
     Source: Zhuk, Kozheshkurt and Yuzefovich (2009), horizontal and vertical models, for "scan".
     """
     if kind not in ("scan", "white"):
         raise ModelError(f"constant_velocity: kind must be 'scan' or 'white', got {kind!r}.")
-    return Motion("velocity-scan" if kind == "scan" else "velocity-white", dims, accel)
+    return Motion("velocity-scan" if kind == "scan" else "velocity-white", dims, accel, turn=turn)
 
 
 def constant_acceleration(dims: int, jerk: Matrix) -> "Motion":
@@ -83,6 +90,7 @@ class Motion:
     dims: int
     noise: Matrix
     tau: Matrix | None = None
+    turn: Matrix | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.dims, int) or self.dims < 1:
@@ -99,6 +107,18 @@ class Motion:
                 sign = "positive" if field == "tau" else "not negative"
                 raise ModelError(f"{word} must be {sign}, got {array.min():g}.")
             object.__setattr__(self, field, array)
+        if self.turn is not None:
+            self._check_turn()
+
+    def _check_turn(self) -> None:
+        if self.dims < 2:
+            raise ModelError(f"a turn needs a plane: dims must be 2 or more, got {self.dims}.")
+        if is_fixed(self.turn):
+            object.__setattr__(self, "turn", numbers(self.turn, "turn"))
+        if is_fixed(self.noise):
+            noise = np.asarray(self.noise)
+            if noise.ndim and noise.shape[-1] > 1 and not np.array_equal(noise[..., 0], noise[..., 1]):
+                raise ModelError("accel must be equal on the first two axes, in whose plane the velocity turns.")
 
     def __eq__(self, other: object) -> bool:
         return same(self, other)
@@ -112,7 +132,8 @@ class Motion:
         noise_word, tau_word = _LAWS[self.law].words
         noise = resolve(self.noise, chains, noise_word, (self.dims,))
         tau = None if self.tau is None else resolve(self.tau, chains, tau_word, (self.dims,))
-        return replace(self, noise=noise, tau=tau)
+        turn = None if self.turn is None else resolve(self.turn, chains, "turn", ())
+        return replace(self, noise=noise, tau=tau, turn=turn)
 
     def step(self, dt: FloatArray, t: FloatArray | None = None) -> Step:
         """Matrices over intervals, in closed form."""
@@ -121,8 +142,12 @@ class Motion:
         axes = max(noise.ndim, tau.ndim)
         step = intervals(dt)
         step = step.reshape(*step.shape, *(1,) * axes)
-        F, Q = law.blocks(step, noise, tau)
-        return Step(_blocks(F, self.dims), _blocks(Q, self.dims), None)
+        F, Q = (_blocks(block, self.dims) for block in law.blocks(step, noise, tau))
+        if self.turn is not None:
+            kind: Literal["scan", "white"] = "scan" if self.law == "velocity-scan" else "white"
+            plane = turning(step[..., 0], fixed(self.turn, "turn"), noise[..., 0], kind)
+            F, Q = (_with_plane(block, own) for block, own in zip((F, Q), plane, strict=True))
+        return Step(F, Q, None)
 
     def sde(self) -> LinearSDE:
         """The same motion as a stochastic differential equation.
@@ -145,7 +170,14 @@ class Motion:
             G[..., -1, 0] = noise * np.sqrt(2 / tau)
         else:
             G[..., -1, 0] = np.sqrt(noise)
-        return LinearSDE(_blocks(F, self.dims), _blocks(G, self.dims))
+        drift, spread = _blocks(F, self.dims), _blocks(G, self.dims)
+        if self.turn is not None:
+            turn = fixed(self.turn, "turn")
+            drift = np.broadcast_to(
+                drift, (*np.broadcast_shapes(drift.shape[:-2], turn.shape), *drift.shape[-2:])
+            ).copy()
+            drift[..., 1, 3], drift[..., 3, 1] = turn, -turn
+        return LinearSDE(drift, spread)
 
     def _parameters(self) -> tuple[FloatArray, FloatArray]:
         noise_word, tau_word = _LAWS[self.law].words
@@ -164,6 +196,14 @@ def _blocks(block: FloatArray, dims: int) -> FloatArray:
     for axis in range(dims):
         result[..., axis, :, axis, :] = block[..., axis % block.shape[-3], :, :]
     return result.reshape(*lead, dims * rows, dims * cols)
+
+
+def _with_plane(block: FloatArray, plane: FloatArray) -> FloatArray:
+    """Matrices (..., n, n) whose first two axes are replaced by (..., 4, 4)."""
+    lead = np.broadcast_shapes(block.shape[:-2], plane.shape[:-2])
+    result = np.broadcast_to(block, (*lead, *block.shape[-2:])).copy()
+    result[..., :4, :4] = plane
+    return result
 
 
 def _matrix(rows: Sequence[Sequence[FloatArray | float]]) -> FloatArray:
