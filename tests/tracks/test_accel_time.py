@@ -30,7 +30,7 @@ def test_the_growth_is_that_of_white_acceleration_in_any_steps(form):
 
 
 def test_without_it_a_track_seen_more_often_is_stiffer():
-    settings = FilterSettings(**ACCEL)
+    settings = FilterSettings(accel_time=0.0, **ACCEL)
     speed = [grown(settings, steps)[1, 1] for steps in (2, 20)]
     assert speed == pytest.approx([2 * (0.3 * 2.0) ** 2, 20 * (0.3 * 0.2) ** 2])
     lasting = grown(FilterSettings(accel_time=LASTS, **ACCEL), 20)[1, 1]

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, ncx2
 from tracking_scenes import measured
 
 from saltus.tracks.faults import SourceCondition, plot_law
@@ -14,8 +14,9 @@ from saltus.tracks.lifecycle import CONFIRMED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
 DT = 4.0
-AGILE = FilterSettings(accel_h=(0.2, 8.0), sojourn_h=(60.0, 20.0), accel_v=(0.2, 4.0), sojourn_v=(60.0, 20.0))
-STEADY = FilterSettings(accel_h=(2.0,), sojourn_h=(60.0,), accel_v=(1.0,), sojourn_v=(60.0,))
+STAYS = dict(sojourn_h=(60.0, 20.0), accel_v=(0.2, 4.0), sojourn_v=(60.0, 20.0))
+AGILE = FilterSettings(accel_h=(0.2, 8.0), **STAYS, turn_rate=(), accel_time=0.0)
+STEADY = FilterSettings(accel_h=(2.0,), sojourn_h=(60.0,), accel_v=(1.0,), sojourn_v=(60.0,), accel_time=0.0)
 COV = np.kron(np.eye(3), [[900.0, 60.0], [60.0, 25.0]])  # of every start, per axis position and velocity
 
 
@@ -93,10 +94,7 @@ def test_the_gate_is_that_of_a_manoeuvre(rng, form):
     """Targets that begin to manoeuvre are inside at the stated probability, steady ones more often."""
     n, p = 3600, 0.95
     mean = far_apart(n)
-    filters = FilterSettings(
-        form=form,
-        **{f: getattr(AGILE, f) for f in ("accel_h", "sojourn_h", "accel_v", "sojourn_v")},
-    )
+    filters = replace(AGILE, form=form)
     shares = []
     for accel in (8.0, 0.2):
         z, height = later(rng, mean, accel, 25.0)
@@ -104,6 +102,32 @@ def test_the_gate_is_that_of_a_manoeuvre(rng, form):
         shares.append(own_share(*gated(filters, mean, m, probability=p)) / n)
     assert abs(shares[0] - p) < 5 * np.sqrt(p * (1 - p) / n)
     assert shares[1] > p + 5 * np.sqrt(p * (1 - p) / n)
+
+
+@pytest.mark.parametrize("form", ["decomposed", "joint"])
+def test_a_target_that_turns_stays_inside(rng, form):
+    """Turns of 12 degrees in a scan, 84 m off the straight, to either side.
+
+    With S the variance of a straight way's innovations a filter without turns sees d^2/S = 3.9 of noncentrality; with
+    them the gate reaches sqrt(1 + 3.9) times as far to the sides, and 2 of its 6.7 deviations are the turn's.
+    """
+    n, p, turn = 900, 0.99, np.radians(3.0)
+    mean = far_apart(n)
+    filters = FilterSettings(form=form, accel_h=(0.2, 0.5), **STAYS, turn_rate=(3.0,))
+    speed = mean[:, 1] + 1j * mean[:, 3]
+    for side in (turn, -turn):
+        bent = mean.copy()
+        way = speed * (np.exp(-1j * side * DT) - 1.0) / (-1j * side)  # clockwise is negative about the vertical
+        bent[:, 0] += way.real - DT * mean[:, 1]
+        bent[:, 2] += way.imag - DT * mean[:, 3]
+        z, height = later(rng, bent, 0.2, 5.0)
+        m = measured(np.full(n, DT), z[:, :2], 5.0, altitude=height)
+        error = 5.0 * np.sqrt(p * (1.0 - p) / n)
+        assert own_share(*gated(filters, mean, m, probability=p)) / n > p - error
+        straight = own_share(*gated(replace(filters, turn_rate=()), mean, m, probability=p)) / n
+        S = [1.0, DT] @ COV[:2, :2] @ [1.0, DT] + 0.5**2 * 4.0 * DT**3 / 3.0 + 5.0**2
+        expected = ncx2.cdf(chi2.ppf(p, 2), 2, np.abs(way[0] - DT * speed[0]) ** 2 / S)
+        assert abs(straight - expected) < 5.0 * np.sqrt(expected * (1.0 - expected) / n)
 
 
 @pytest.mark.parametrize("identity", [True, False])

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
 
+from saltus.errors import ModelError
 from saltus.filters import imm_filter
 from saltus.tracks.kinematics import Plan, Start, make_kinematics, two_point_start, with_speed_prior
 from saltus.tracks.settings import FilterSettings
 
 STEPS = np.array([4.0, 3.7, 4.4, 8.1, 0.2, 4.0])
 SETTINGS = dict(accel_h=(0.5, 6.0), sojourn_h=(80.0, 20.0), accel_v=(0.2, 3.0, 9.0), sojourn_v=(60.0, 15.0, 5.0))
+LEVELS = SETTINGS | dict(accel_time=0.0, turn_rate=())
 
 
 def trans(sojourn, dt):
@@ -70,7 +72,7 @@ def carried(settings, tracks):
 
 def test_decomposed_is_two_batch_filters_side_by_side(tracks):
     start, position, cov = tracks
-    found, total = carried(FilterSettings(form="decomposed", **SETTINGS), tracks)
+    found, total = carried(FilterSettings(form="decomposed", **LEVELS), tracks)
     expected_total = 0.0
     for axes, accel, sojourn in (
         ([0, 1], SETTINGS["accel_h"], SETTINGS["sojourn_h"]),
@@ -104,7 +106,7 @@ def test_decomposed_is_two_batch_filters_side_by_side(tracks):
 
 def test_joint_is_the_batch_filter_with_both_chains_and_full_covariance(tracks):
     start, position, cov = tracks
-    found, total = carried(FilterSettings(form="joint", **SETTINGS), tracks)
+    found, total = carried(FilterSettings(form="joint", **LEVELS), tracks)
     h, v = SETTINGS["accel_h"], SETTINGS["accel_v"]
     lift = (3, len(h), len(v))
     est = imm_filter(
@@ -125,6 +127,86 @@ def test_joint_is_the_batch_filter_with_both_chains_and_full_covariance(tracks):
         np.testing.assert_allclose(moments.p_manoeuvre_v, 1.0 - est.probs[:, k, :, 0].sum(-1), atol=1e-10)
     np.testing.assert_allclose(total, est.log_likelihood, rtol=1e-8)
     assert np.abs(found[-1].cov[:, :4, 4:]).max() > 1.0  # what the decomposition would drop
+
+
+TURNS = SETTINGS | dict(turn_rate=(1.5, 4.0), turn_sojourn=25.0, accel_time=5.0)
+RATES = np.radians([0.0, -1.5, 1.5, -4.0, 4.0, 0.0])  # to the right: steady, two pairs of turns, manoeuvre
+DENSITY = 5.0 * np.square([0.5, 1.8, 1.8, 1.8, 1.8, 6.0])  # a turn has three tenths of 6 m/s^2 besides
+
+
+def turning(rate, density, dt):
+    """Van Loan's form of dv = rate (vy, -vx) dt + dW."""
+    A = np.zeros((4, 4))
+    A[0, 1] = A[2, 3] = 1.0
+    A[1, 3], A[3, 1] = rate, -rate
+    both = expm(np.block([[-A, density * np.diag([0.0, 1.0, 0.0, 1.0])], [np.zeros((4, 4)), A.T]]) * dt)
+    F = both[4:, 4:].T
+    return F, F @ both[:4, 4:]
+
+
+def turning_trans(dt):
+    """Four of five departures from steady motion to the manoeuvre, nine of ten from elsewhere to steady motion."""
+    away = np.full((6, 6), 0.1 / 4)
+    away[0], away[1:, 0] = [0.0, 0.05, 0.05, 0.05, 0.05, 0.8], 0.9
+    np.fill_diagonal(away, 0.0)
+    rates = (away - np.eye(6)) / np.array([80.0, 25.0, 25.0, 25.0, 25.0, 20.0])[:, None]
+    return expm(rates * dt)
+
+
+def test_turns_are_modes_of_the_batch_filter(tracks):
+    start, position, cov = tracks
+    found, _ = carried(FilterSettings(form="decomposed", **TURNS), tracks)
+    F, Q = np.moveaxis([[turning(rate, q, dt) for rate, q in zip(RATES, DENSITY, strict=True)] for dt in STEPS], 2, 0)
+    est = imm_filter(
+        position[..., :2],
+        F=F,
+        Q=Q,
+        H=np.eye(4)[0::2][None],
+        R=cov[:, :, :2, :2][:, :, None],
+        trans=[np.array([turning_trans(dt) for dt in STEPS])],
+        mean0=np.repeat(start.mean[:, None, :4], 6, axis=1),
+        cov0=np.repeat(start.cov[:, None, :4, :4], 6, axis=1),
+        probs0=turning_trans(1e6)[0],
+    )
+    for k, moments in enumerate(found):
+        np.testing.assert_allclose(moments.mean[:, :4], est.mean[:, k], rtol=1e-9, atol=1e-8)
+        np.testing.assert_allclose(moments.cov[:, :4, :4], est.cov[:, k], rtol=1e-9, atol=1e-8)
+        np.testing.assert_allclose(moments.p_manoeuvre_h, 1.0 - est.probs[:, k, 0], rtol=1e-9, atol=1e-12)
+
+
+def test_beside_turns_the_joint_form_differs_by_the_cross_covariance_alone(tracks):
+    """Without covariance between height and the plane, in the start or in a plot, both forms are one filter."""
+    start, position, cov = (part.copy() if isinstance(part, np.ndarray) else part for part in tracks)
+    start.cov[:, :4, 4:] = 0.0
+    start.cov[:, 4:, :4] = 0.0
+    cov[..., :2, 2] = cov[..., 2, :2] = 0.0
+    single = TURNS | dict(accel_v=(3.0,), sojourn_v=(15.0,))  # mixing over the product of modes keeps them apart
+    apart, joint = (
+        carried(FilterSettings(form=form, **single), (start, position, cov))[0] for form in ("decomposed", "joint")
+    )
+    for one, other in zip(apart, joint, strict=True):
+        for field in ("mean", "cov", "p_manoeuvre_h"):
+            np.testing.assert_allclose(getattr(one, field), getattr(other, field), rtol=1e-7, atol=1e-7)
+
+
+def test_a_single_level_has_no_turns():
+    one = make_kinematics(FilterSettings(accel_h=(1.0,), sojourn_h=(60.0,)))
+    assert [channel.bank.sizes for channel in one.channels] == [(1,), (2,)]
+    assert [channel.bank.sizes for channel in make_kinematics(FilterSettings()).channels] == [(4,), (2,)]
+
+
+@pytest.mark.parametrize(
+    "value, message",
+    [
+        (dict(turn_rate=(0.0,)), r"filter\.turn_rate holds rates"),
+        (dict(turn_rate=(1.5, 90.0)), r"up to 45 degrees/s; got \(1\.5, 90\.0\)"),
+        (dict(turn_rate=(np.nan,)), r"filter\.turn_rate"),
+        (dict(turn_sojourn=0.0), r"filter\.turn_sojourn is a time"),
+    ],
+)
+def test_turns_that_cannot_be(value, message):
+    with pytest.raises(ModelError, match=message):
+        FilterSettings(**value)
 
 
 def test_a_plot_without_height_leaves_the_height_predicted(tracks):
@@ -170,13 +252,27 @@ def test_a_late_plot_measures_where_the_target_was(tracks):
 
 def test_the_widest_mode_is_the_most_agile(tracks):
     start, *_ = tracks
-    kinematics = make_kinematics(FilterSettings(form="joint", **SETTINGS))
+    kinematics = make_kinematics(FilterSettings(form="joint", **LEVELS))
     copies = kinematics.predicted(kinematics.add(start), np.full(3, 4.0))
     mean, P = copies.widest(np.arange(3))
     F = block_diag(*[F_axis(4.0)] * 3)
     Q = block_diag(Q_axis(6.0, 4.0), Q_axis(6.0, 4.0), Q_axis(9.0, 4.0))
     np.testing.assert_allclose(mean, start.mean @ F.T, rtol=1e-9)
     np.testing.assert_allclose(P, F @ start.cov @ F.T + Q, rtol=1e-9)
+
+
+def test_turns_widen_what_a_gate_must_hold(tracks):
+    start, *_ = tracks
+    kinematics = make_kinematics(FilterSettings(**TURNS))
+    copies = kinematics.predicted(kinematics.add(start), np.full(3, 4.0))
+    mean, P = copies.widest(np.arange(3))
+    # Every mode of a new track is alike, so mixing changes nothing and each mode's mean is its own F times the start's.
+    F, Q = turning(0.0, DENSITY[-1], 4.0)
+    own = start.mean[:, :4] @ F.T
+    apart = np.stack([start.mean[:, :4] @ turning(rate, 1.0, 4.0)[0].T - own for rate in RATES[1:5]], axis=1)
+    np.testing.assert_allclose(mean[:, :4], own, rtol=1e-9)
+    expected = F @ start.cov[:, :4, :4] @ F.T + Q + np.einsum("kti,ktj->kij", apart, apart) / 4.0
+    np.testing.assert_allclose(P[:, :4, :4], expected, rtol=1e-9)
 
 
 def test_two_point_start_is_the_notes_formula(rng):

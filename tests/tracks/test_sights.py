@@ -16,7 +16,7 @@ from saltus.tracks.tracker import Tracker, join_rows
 
 LATITUDE, LONGITUDE = np.radians([63.4, 10.4])
 PLANE = Plane(float(LATITUDE), float(LONGITUDE))
-ONE_MODE = FilterSettings(accel_h=(0.1,), sojourn_h=(100.0,), accel_v=(0.01,), sojourn_v=(100.0,))
+ONE_MODE = FilterSettings(accel_h=(0.1,), sojourn_h=(100.0,), accel_v=(0.01,), sojourn_v=(100.0,), accel_time=0.0)
 SETTINGS = TrackerSettings(
     detection_probability=0.9, clutter_density=1e-6, max_speed=15.0, coast_seconds=8.0, height_prior=(0.0, 10.0)
 )

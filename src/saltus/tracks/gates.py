@@ -40,8 +40,8 @@ class Gated(NamedTuple):
 class Gate:
     """Chi-square gates at a stated probability: horizontal (2 degrees of freedom) and height (1).
 
-    The gate is that of the most agile mode, so that a manoeuvre begun since the last plot stays inside; which mode
-    explains the plot is for the likelihoods to say.
+    The gate is that of the most agile mode, wide enough for turns, so that a manoeuvre begun since the last plot stays
+    inside; which mode explains the plot is for the likelihoods to say.
     """
 
     def __init__(self, settings: TrackerSettings, filters: FilterSettings, *, use_identity: bool) -> None:
@@ -51,6 +51,7 @@ class Gate:
         self.fault = _chi2_quantile(_FAULT_GATE, 2)
         self._growth = settings.degraded_noise**2
         self._accel, self._accel_time = max(filters.accel_h), filters.accel_time
+        self._turn = float(np.radians(max(filters.turn_rate, default=0.0)))
         self._use_identity = use_identity
 
     def __call__(
@@ -170,6 +171,8 @@ class Gate:
         variance = cov[:, 0, 0] + cov[:, 2, 2] + dt**2 * (cov[:, 1, 1] + cov[:, 3, 3])
         variance += 2.0 * dt * np.abs(cov[:, 0, 1] + cov[:, 2, 3])
         variance += self._accel**2 * dt**3 * (0.5 * dt + 2.0 / 3.0 * self._accel_time)
+        aside = 0.5 * self._turn * dt**2  # per m/s: how far a turn leads off the straight
+        variance += aside**2 * np.square(life.mean[rows][:, _VELOCITY[:2]]).sum(axis=1)
         return np.asarray(np.sqrt(self.horizontal * (variance + plot_variance)))
 
     def _astray(self, m: Measurements, plot: _Index, bounds: "_Bounds") -> _Array:

@@ -9,6 +9,8 @@ import numpy.typing as npt
 from saltus.errors import NumericalError
 from saltus.filters import Bank, Belief
 from saltus.models import Chain, Motion, constant_velocity
+from saltus.tracks.intervals import Intervals
+from saltus.tracks.modes import Mode, horizontal_chain, vertical_chain
 from saltus.tracks.settings import FilterSettings
 
 __all__ = [
@@ -52,12 +54,13 @@ class Start(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A bank of multimode filters over some axes of space (0 x, 1 y, 2 z), constant velocity along each."""
+    """A bank of multimode filters over some axes of space (0 x, 1 y, 2 z), constant velocity along each, or turns."""
 
     axes: npt.NDArray[np.intp]
     chains: tuple[Chain, ...]
     states: npt.NDArray[np.intp]  # positions of the channel's states among the six
-    motion: Motion  # bound to the chains
+    intervals: Intervals  # of the motion and the chains
+    turns: tuple[int, ...]  # states of the first chain that turn
     bank: Bank
 
     def belief(self, start: Start) -> Belief:
@@ -78,9 +81,8 @@ class Channel:
     def predicted(self, rows: _Rows, dt: _Array) -> "Channel":
         """Copies of rows, numbered from 0, mixed and moved forward by dt."""
         ahead = self.bank.take(rows)
-        F, Q, _ = self.motion.step(dt)
-        trans = [None if len(chain) == 1 else chain.transition(dt) for chain in self.chains]
-        ahead.step(np.arange(len(rows)), trans, F, None, Q)
+        over = self.intervals.at(dt)
+        ahead.step(np.arange(len(rows)), over.trans, over.F, None, over.Q)
         return replace(self, bank=ahead)
 
     def update(self, rows: _Rows, plan: Plan) -> None:
@@ -169,13 +171,20 @@ class Kinematics:
         return np.asarray(sum(parts))
 
     def widest(self, rows: _Rows) -> tuple[_Array, _Array]:
-        """Mean and covariance of the most agile mode of every channel: what a gate must not cut off."""
+        """What a gate must not cut off, as mean and covariance of every channel.
+
+        P + sum_t d_t d_t' / n over the n turns t: the most agile mode's covariance P, and the distances d_t of the
+        means in turns from its own.
+        """
         mean, cov = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6))
         for channel in self.channels:
             s = channel.states
             belief = channel.bank.read(rows)
             last: tuple[slice | int, ...] = (slice(None), *(-1 for _ in channel.chains))
             mean[:, s], cov[:, s[:, None], s] = belief.means[last], belief.covs[last]
+            if channel.turns:
+                apart = belief.means[(slice(None), list(channel.turns), *last[2:])] - mean[:, None, s]
+                cov[:, s[:, None], s] += np.einsum("kti,ktj->kij", apart, apart) / len(channel.turns)
         return mean, cov
 
     def put(self, rows: _Rows, other: "Kinematics", other_rows: _Rows) -> None:
@@ -198,32 +207,30 @@ class Kinematics:
 
 def make_kinematics(settings: FilterSettings) -> Kinematics:
     """Build the empty filters that the settings describe."""
-    lasts = settings.accel_time
-    kind: Literal["scan", "white"] = "white" if lasts else "scan"
-    accel_h, accel_v = (
-        tuple(a * a * lasts if lasts else a for a in accel) for accel in (settings.accel_h, settings.accel_v)
+    kind: Literal["scan", "white"] = "white" if settings.accel_time else "scan"
+    h, v = horizontal_chain(settings), vertical_chain(settings)
+    turn = (
+        (lambda horizontal: horizontal.turn) if any(isinstance(mode, Mode) and mode.turn for mode in h.values) else None
     )
-    h, v = _chain("horizontal", accel_h, settings.sojourn_h), _chain("vertical", accel_v, settings.sojourn_v)
     if settings.form == "joint":
-        motion = constant_velocity(3, accel=lambda horizontal, vertical: [horizontal, horizontal, vertical], kind=kind)
+        motion = constant_velocity(
+            3,
+            accel=lambda horizontal, vertical: [horizontal.accel, horizontal.accel, vertical.accel],
+            kind=kind,
+            turn=turn,
+        )
         return Kinematics((_channel([0, 1, 2], (h, v), motion),))
-    horizontal = constant_velocity(2, accel=lambda horizontal: horizontal, kind=kind)
-    vertical = constant_velocity(1, accel=lambda vertical: vertical, kind=kind)
+    horizontal = constant_velocity(2, accel=lambda horizontal: horizontal.accel, kind=kind, turn=turn)
+    vertical = constant_velocity(1, accel=lambda vertical: vertical.accel, kind=kind)
     return Kinematics((_channel([0, 1], (h,), horizontal), _channel([2], (v,), vertical)))
-
-
-def _chain(name: str, accel: tuple[float, ...], sojourn: tuple[float, ...]) -> Chain:
-    if len(accel) == 1:
-        return Chain(name, {"steady": accel[0]}, trans=[[1.0]])
-    labels = ["steady", *(f"manoeuvre{i}" for i in range(1, len(accel)))]
-    return Chain(name, dict(zip(labels, accel, strict=True)), sojourn=dict(zip(labels, sojourn, strict=True)))
 
 
 def _channel(axes: list[int], chains: tuple[Chain, ...], motion: Motion) -> Channel:
     bank = Bank(2 * len(axes), tuple(len(chain) for chain in chains))
     position = 2 * np.array(axes)
     states = np.stack([position, position + 1], axis=-1).ravel()
-    return Channel(np.array(axes), chains, states, motion.bind(chains), bank)
+    turns = tuple(k for k, mode in enumerate(chains[0].values) if isinstance(mode, Mode) and mode.turn)
+    return Channel(np.array(axes), chains, states, Intervals(motion.bind(chains), chains), turns, bank)
 
 
 def two_point_start(first: _Array, first_cov: _Array, second: _Array, second_cov: _Array, dt: _Array) -> Start:

@@ -9,33 +9,42 @@ from saltus.errors import ModelError
 
 __all__ = ["FilterSettings", "TrackerSettings"]
 
+_FASTEST_TURN = 45.0  # degrees/s: faster, a turn is a circle between two plots
+
 
 @dataclass(frozen=True, slots=True)
 class FilterSettings:
     """The multimode filters of every track.
 
-    Modes are levels of acceleration, constant within a scan and independent between scans (sigma, m/s^2), the first
-    of them steady motion; each chain leaves a state after its mean sojourn. Several sources divide the time between
-    them: give `accel_time`, or a track seen more often is taken for one that turns less.
+    Horizontal modes are steady motion, turns to the left and right at given rates, and levels of acceleration; each
+    is left after its mean stay. A mode's acceleration is white noise of density accel^2 accel_time, the same for a
+    target whatever sees it, how often, and from how many places.
 
     Attributes:
         form: "decomposed" runs a horizontal and a vertical filter side by side; "joint" one filter in three
             dimensions with the product of the modes and the full covariance of each plot, which matters at short
             range and high elevation.
-        accel_h: acceleration of each horizontal mode, m/s^2, steady first.
-        sojourn_h: mean stay in each horizontal mode, s.
+        accel_h: acceleration of each horizontal mode that does not turn, m/s^2, steady first.
+        sojourn_h: mean stay in each of them, s.
+        turn_rate: rates of turn, degrees/s; each is two modes, left and right. Of the hardest acceleration of
+            `accel_h`, three tenths come on top of a turn. () = no such modes, nor
+            beside a single level of acceleration.
+        turn_sojourn: mean stay in each turn, s.
         accel_v: acceleration of each vertical mode, m/s^2.
         sojourn_v: mean stay in each vertical mode, s.
-        accel_time: s that an acceleration lasts, whatever the intervals between plots: white acceleration of density
-            accel^2 accel_time, which is alike at this interval. 0 = it lasts from plot to plot.
+        accel_time: s that an acceleration lasts, whatever the intervals between plots. 0 = from plot to plot: it is
+            constant between two and independent in the next interval, so a track seen more often is taken for one
+            that turns less.
     """
 
     form: Literal["decomposed", "joint"] = "decomposed"
     accel_h: tuple[float, ...] = (0.15, 3.0)
-    sojourn_h: tuple[float, ...] = (120.0, 25.0)
+    sojourn_h: tuple[float, ...] = (150.0, 10.0)
+    turn_rate: tuple[float, ...] = (1.5,)
+    turn_sojourn: float = 15.0
     accel_v: tuple[float, ...] = (0.1, 2.5)
     sojourn_v: tuple[float, ...] = (90.0, 15.0)
-    accel_time: float = 0.0
+    accel_time: float = 4.0
 
     def __post_init__(self) -> None:
         """Refuse settings that describe no filter."""
@@ -54,6 +63,13 @@ class FilterSettings:
                 raise ModelError(f"filter.accel_{axis} and filter.sojourn_{axis} must be positive: m/s^2 and s.")
             if list(accel) != sorted(accel):
                 raise ModelError(f"filter.accel_{axis} must ascend, steady motion first; got {accel}.")
+        if any(not 0.0 < rate <= _FASTEST_TURN for rate in self.turn_rate):
+            raise ModelError(
+                f"filter.turn_rate holds rates of turn to either side, above 0 and up to {_FASTEST_TURN:g} degrees/s; "
+                f"got {self.turn_rate}."
+            )
+        if not 0.0 < self.turn_sojourn < np.inf:
+            raise ModelError(f"filter.turn_sojourn is a time in s, got {self.turn_sojourn}.")
 
 
 @dataclass(frozen=True, slots=True)
