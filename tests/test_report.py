@@ -14,7 +14,9 @@ import pytest
 from saltus.geo import Site
 from saltus.records import REASONS, Kind, Plots, Source, System
 from saltus.report import colours, data, tables, write_report
+from saltus.report.sensors import HEIGHT, WIDTH
 from saltus.report.updates import groups, read_updates
+from saltus.tracks.health import Degraded, Health
 
 T0 = 1_700_000_000.0
 SITE = Site(np.radians(41.3), np.radians(2.1), 27.3, 0.0)
@@ -361,3 +363,27 @@ def test_colours_are_even_steps_that_darken():
         # Another measure of lightness: CIE Y, by the Rec. 709 weights.
         luminance = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722]
         assert (np.diff(luminance) < 0).all()
+
+
+def test_sensors_in_time(tmp_path):
+    """Bars of faulty plots, lines of P(degraded), and the spells as text; a sensor without plots is left out."""
+    time = T0 + np.arange(0.0, 160.0, 0.5)
+    fault = np.zeros(len(time), np.int8)
+    fault[time < T0 + 1.0] = 2  # both plots of the first bin, in range
+    p = np.stack([np.where((time > T0 + 80) & (time < T0 + 120), 0.9, 0.0), np.zeros(len(time))], axis=-1)
+    spell = Degraded(T0 + 80.5, T0 + 119.5, "azimuth degraded", 0.9)
+    radar = Health(f"Radar {EVIL}", ("azimuth", "range"), time, fault, time, p, [spell])
+    idle = Health("Idle", ("position",), time[:0], fault[:0], time[:0], p[:0, :1], [])
+    page = render(tmp_path, **scene(), sensors=[radar, idle])
+    assert EVIL not in page.text and "Idle" not in page.text
+    paths = [attrs for tag, attrs in page.elements if tag == "path"]
+    assert [a["class"] for a in paths] == ["bars h", "bars v", "line h", "line v"]
+    assert paths[0]["d"] == ""
+    span = 4.0 * 39 + 1.0  # s, of the page's plots and tracks
+    assert paths[1]["d"].count("M") == 1 and f"V{HEIGHT * 0:.1f}" in paths[1]["d"]  # a whole bin faulty: full height
+    points = np.array([xy.split() for xy in paths[2]["d"][1:].split("L")], float)
+    high = points[points[:, 1] < HEIGHT / 2, 0] / WIDTH * span
+    assert 79.0 < high.min() < 82.0 and 118.0 < high.max() < 121.0
+    assert "azimuth degraded, P 0.90" in page.text
+    assert [tag for tag, a in page.elements if a.get("id") == "sensors"] == ["section"]
+    assert "Sensors in time" not in render(tmp_path, **scene()).text

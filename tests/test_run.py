@@ -196,6 +196,17 @@ def test_numbers_are_finite_and_covariances_positive(two):
     assert time[0] >= MIDNIGHT + START
 
 
+def test_summary_states_the_faults_of_each_sensor(two):
+    faults = two[3].summary["faults"]
+    assert list(faults) == list(two[3].summary["noise"])
+    for row in faults.values():
+        assert set(row) == {"judged_plots", "flagged_plots", "flagged_share", "flagged", "degraded"}
+        assert set(row["flagged"]) == {"azimuth", "range"}
+        assert row["judged_plots"] > 100
+        assert sum(row["flagged"].values()) == row["flagged_plots"] < 0.02 * row["judged_plots"]
+        assert row["degraded"] == []  # two radars whose errors stay what they are
+
+
 def test_summary_states_the_noise_of_each_sensor(two):
     noise = two[3].summary["noise"]
     assert {row["system"] for row in noise.values()} == {"CAT048:25/1", "CAT048:25/2"}

@@ -21,7 +21,7 @@ from saltus.geo import Site
 from saltus.io.write import output_directory
 from saltus.progress import Progress, progress_bar
 from saltus.records import REASONS, Kind, Plots, Recording, Source
-from saltus.summary import SIGMAS, Sensors, Tracked, noise_rows, reported_kind, show_summary, summarise
+from saltus.summary import SIGMAS, Sensors, Tracked, health_of, noise_rows, reported_kind, show_summary, summarise
 from saltus.tracks.measurements import Measurements, default_noise, make_plane, place_plots
 from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
 from saltus.tracks.output import assignment_table, innovation_table, track_table
@@ -99,6 +99,7 @@ def track_files(
                 innovations=gates,
                 summary={**summary, "noise": noise_rows(summary)},
                 sites=sites,
+                sensors=health_of(sensors, tracked),
             )
     show_summary(summary, output, report)
     return summary

@@ -13,11 +13,12 @@ import pyarrow.compute as pc
 
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots
+from saltus.tracks.health import Health, sensor_health
 from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
 from saltus.tracks.tracker import Assignments, Rows
 
-__all__ = ["SIGMAS", "Sensors", "Tracked", "noise_rows", "reported_kind", "show_summary", "summarise"]
+__all__ = ["SIGMAS", "Sensors", "Tracked", "health_of", "noise_rows", "reported_kind", "show_summary", "summarise"]
 
 _DOUBTFUL_NIS = 3.0  # of two degrees of freedom
 _UNITS = {"sigma_range_m": "σ of range, m", "sigma_azimuth_deg": "σ of azimuth, °", "sigma_xy_m": "σ of position, m"}
@@ -100,6 +101,7 @@ def summarise(
             "coasted": int((status == "coasted").sum()),
         },
         "noise": noise,
+        "faults": _fault_table(health_of(sensors, tracked)),
         "problems": [*problems, *_doubts(noise)],
     }
 
@@ -125,6 +127,46 @@ def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, 
         row["nis_mean"] = _rounded(float(d2[at].mean()) if at.any() else np.nan)
         row["nis_expected"] = 2.0
         table[name if name not in table else f"{name} ({plots.sources[s].system})"] = row
+    return table
+
+
+def health_of(sensors: Sensors, tracked: Tracked) -> list[Health]:
+    """Gather the faults that the tracker found, by source."""
+    m, confirmed = tracked.measurements, tracked.assignments.confirmed
+    parts = [rows for rows in tracked.rows if len(rows.time)]
+    columns = {
+        name: np.concatenate([np.zeros(0, int), *(getattr(rows, name) for rows in parts)])
+        for name in ("measurement", "track_id", "p_fault", "fault")
+    }
+    at = (columns["measurement"] >= 0) & np.isin(columns["track_id"], confirmed)
+    plot = columns["measurement"][at].astype(np.intp)
+    own = np.isnan(m.bearing[plot])  # a bearing says nothing of faults: its row repeats the last plot's
+    p, fault = columns["p_fault"][at][own], columns["fault"][at][own].astype(np.int8)
+    plot = plot[own]
+    return sensor_health(sensors.names, tracked.assignments.sources, m.source[plot], m.time[plot], p, fault)
+
+
+def _fault_table(sensors: Sequence[Health]) -> dict[str, object]:
+    """State for each source how many of its plots were faulty, and when it was degraded."""
+    table: dict[str, object] = {}
+    for s, sensor in enumerate(sensors):
+        n = len(sensor.time)
+        counts = {name: int((sensor.fault == 1 + c).sum()) for c, name in enumerate(sensor.components)}
+        table[sensor.name if sensor.name not in table else f"{sensor.name} ({s})"] = {
+            "judged_plots": n,
+            "flagged_plots": sum(counts.values()),
+            "flagged_share": _rounded(sum(counts.values()) / n) if n else None,
+            "flagged": counts,
+            "degraded": [
+                {
+                    "from": d.time_from,
+                    "to": d.time_to,
+                    "condition": d.condition,
+                    "probability": _rounded(d.probability),
+                }
+                for d in sensor.intervals
+            ],
+        }
     return table
 
 
@@ -168,9 +210,20 @@ def show_summary(summary: dict[str, Any], output: Path, report: bool) -> None:
             if label.startswith("sigma")
         )
         click.echo(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (expected 2)")
+    for name, row in summary["faults"].items():
+        click.echo(_said_of_faults(name, row))
     for problem in summary["problems"]:
         click.echo(f"note: {problem}", err=True)
     seconds = summary["seconds"]
     click.echo(f"decoding {seconds['decoding']} s, tracking {seconds['tracking']} s; written to {output}/")
     if report:
         click.echo(f"open {output / 'report.html'}")
+
+
+def _said_of_faults(name: str, row: dict[str, Any]) -> str:
+    """One line on a source's faults."""
+    kinds = ", ".join(f"{count} in {what}" for what, count in row["flagged"].items())
+    lasting = sum(d["to"] - d["from"] for d in row["degraded"])
+    conditions = ", ".join(dict.fromkeys(d["condition"] for d in row["degraded"]))
+    times = f"{len(row['degraded'])} times, {lasting:.0f} s in all ({conditions})" if row["degraded"] else "never"
+    return f"faults of {name}: {row['flagged_plots']} of {row['judged_plots']} plots ({kinds}); degraded {times}"

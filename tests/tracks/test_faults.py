@@ -11,7 +11,8 @@ from tracking_scenes import SITE, measured, observed, polar_noise, run
 from saltus.errors import ModelError
 from saltus.geo import Plane
 from saltus.simulate import Leg, Radar, Trajectory, observe
-from saltus.tracks.faults import SourceCondition, plot_law
+from saltus.tracks.faults import History, SourceCondition, plot_law
+from saltus.tracks.health import degraded_intervals, sensor_health
 from saltus.tracks.settings import TrackerSettings
 
 DT = 4.0
@@ -235,3 +236,34 @@ def test_impossible_settings_of_faults_are_refused():
     ):
         with pytest.raises(ModelError, match=next(iter(wrong))):
             TrackerSettings(**wrong)
+
+
+def test_spells_of_a_degraded_source():
+    law = plot_law(SETTINGS, polar=True)
+    p = np.zeros((10, 4))
+    p[:, 0] = [1.0, 0.6, 0.4, 0.0, 0.3, 0.9, 1.0, 0.1, 0.6, 0.6]
+    p[:, 2] = 1.0 - p[:, 0]  # azimuth
+    p[7:, 3], p[7:, 2] = p[7:, 2], 0.0
+    spells = degraded_intervals(History(10.0 * np.arange(10), p), law)
+    assert [(s.time_from, s.time_to, s.condition) for s in spells] == [
+        (20.0, 40.0, "azimuth degraded"),
+        (70.0, 90.0, "azimuth and range degraded"),
+    ]
+    np.testing.assert_allclose([s.probability for s in spells], [2.3 / 3, 1.7 / 3])
+    assert degraded_intervals(History(np.zeros(0), np.zeros((0, 4))), law) == []
+
+
+def test_health_counts_by_source_and_component():
+    sources = [SourceCondition(plot_law(SETTINGS, polar=polar), SETTINGS) for polar in (True, False)]
+    found = sensor_health(
+        ["radar", "ads-b"],
+        sources,
+        np.array([0, 1, 0, 0, 1, 0], np.int32),
+        np.array([3.0, 1.0, 2.0, 5.0, 4.0, 6.0]),
+        np.array([0.9, 0.9, 0.1, 0.6, 0.4, np.nan]),
+        np.array([1, 1, 2, 2, 1, 0], np.int8),
+    )
+    assert [h.name for h in found] == ["radar", "ads-b"]
+    assert found[0].time.tolist() == [2.0, 3.0, 5.0] and found[0].fault.tolist() == [0, 1, 2]
+    assert found[1].time.tolist() == [1.0, 4.0] and found[1].fault.tolist() == [1, 0]
+    assert found[0].p_degraded.shape == (0, 2) and found[1].intervals == []

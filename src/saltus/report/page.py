@@ -14,6 +14,7 @@ from saltus.io.write import output_file
 from saltus.records import Plots
 from saltus.report.colours import HEIGHT_ENDS, PROBABILITY_ENDS, colour_map
 from saltus.report.data import payload, time_span
+from saltus.report.sensors import HEIGHT, WIDTH, sensor_rows
 from saltus.report.tables import Block, blocks, innovation_rows, reason_rows, show, title
 from saltus.report.updates import Updates, groups, read_updates
 
@@ -22,12 +23,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from saltus.geo import Site
+    from saltus.tracks.health import Health
 
 __all__ = ["write_report"]
 
 MAX_ROWS = 2000  # tracks listed in the table
 _SCRIPTS = ("base.js", "plan.js", "pointer.js", "timeline.js", "panels.js", "main.js")
-_PLACED = ("inputs", "noise", "problems", "version")  # keys of the summary with a place of their own
+_PLACED = ("faults", "inputs", "noise", "problems", "version")  # keys of the summary with a place of their own
 
 
 def write_report(
@@ -39,6 +41,7 @@ def write_report(
     innovations: "pa.Table",
     summary: Mapping[str, object],
     sites: Mapping[str, "Site"],
+    sensors: Sequence["Health"] = (),
 ) -> None:
     """Write one self-contained HTML page; it needs no network and appears whole or not at all.
 
@@ -52,6 +55,7 @@ def write_report(
         summary: what `summary.json` holds. `inputs` (file names), `noise` (per source) and `problems` (lines) have
             their own places; every other key is laid out as it comes.
         sites: sensors' places by designation (`CAT048:20/129`) or name.
+        sensors: faults of each sensor, for its timeline.
 
     Raises:
         DataError: `path` is a directory.
@@ -69,6 +73,8 @@ def write_report(
         data=_script_json(drawn),
         ramp=drawn["colours"],
         notes=notes,
+        sensors=sensor_rows(sensors, time_span(plots, updates)),
+        panel=(WIDTH, HEIGHT),
         **_header(plots, assignments, updates, summary),
         **_tables(updates, assignments, innovations, summary),
     )

@@ -1,0 +1,89 @@
+"""How sensors fared: plots found faulty, and times at which a source was degraded."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.tracks.faults import History, PlotLaw, SourceCondition
+
+__all__ = ["Degraded", "Health", "degraded_intervals", "sensor_health"]
+
+_Array = npt.NDArray[np.float64]
+
+_FLAG = 0.5  # probability of a fault from which a plot is flagged
+_BEGIN, _END = 0.5, 0.2  # P(degraded) at which an interval begins and ends
+
+
+class Degraded(NamedTuple):
+    """A stretch of time in which a source was probably degraded."""
+
+    time_from: float
+    time_to: float  # of the last scan in it
+    condition: str  # the likeliest over the stretch
+    probability: float  # mean of P(degraded) over its scans
+
+
+class Health(NamedTuple):
+    """One source's plots and condition."""
+
+    name: str
+    components: tuple[str, ...]
+    time: _Array  # (N,): of its plots that updated a track past its start, s
+    fault: npt.NDArray[np.int8]  # (N,): 0 right, else 1 + component
+    scans: _Array  # (T,), s
+    p_degraded: _Array  # (T, components)
+    intervals: list[Degraded]
+
+
+def degraded_intervals(history: History, law: PlotLaw) -> list[Degraded]:
+    """Return the stretches in which P(not well) reached one half, each until it fell below a fifth."""
+    p = 1.0 - history.probs[:, 0]
+    inside, begin, out = False, 0, []
+    for k, value in enumerate(np.append(p, 0.0)):
+        if not inside and value >= _BEGIN:
+            inside, begin = True, k
+        elif inside and value < _END:
+            inside = False
+            mean = history.probs[begin:k].mean(axis=0)
+            worst = law.degraded[1 + int(mean[1:].argmax())]
+            names = [name for name, bad in zip(law.components, worst, strict=True) if bad]
+            out.append(
+                Degraded(
+                    float(history.time[begin]),
+                    float(history.time[k - 1]),
+                    " and ".join(names) + " degraded",
+                    float(p[begin:k].mean()),
+                )
+            )
+    return out
+
+
+def sensor_health(
+    names: Sequence[str],
+    sources: Sequence[SourceCondition],
+    source: npt.NDArray[np.int32],
+    time: _Array,
+    p_fault: _Array,
+    fault: npt.NDArray[np.int8],
+) -> list[Health]:
+    """Gather what was found of each source.
+
+    Args:
+        names: of the sources.
+        sources: their conditions.
+        source: of each plot that updated a confirmed track, index, (N,).
+        time: of it, s.
+        p_fault: probability that it was faulty, NaN where nothing told.
+        fault: its likeliest fault, 1 + component.
+    """
+    out = []
+    for s, (name, condition) in enumerate(zip(names, sources, strict=True)):
+        mine = np.flatnonzero((source == s) & np.isfinite(p_fault))
+        mine = mine[np.argsort(time[mine], kind="stable")]
+        history, law = condition.history, condition.law
+        kinds = np.where(p_fault[mine] > _FLAG, fault[mine], 0).astype(np.int8)
+        p = history.probs @ law.degraded
+        out.append(Health(name, law.components, time[mine], kinds, history.time, p, degraded_intervals(history, law)))
+    return out
