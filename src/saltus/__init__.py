@@ -15,6 +15,7 @@ _EXPORTS = {
     "HybridModel": "saltus.models",
     "IMM": "saltus.filters",
     "LinearSDE": "saltus.models",
+    "ParticleFilter": "saltus.filters",
     "PositionSensor": "saltus.models",
     "Record": "saltus.filters",
     "coloured_filter": "saltus.filters",

@@ -8,6 +8,7 @@ from saltus.filters.grid import GridDensity, GridFilter
 from saltus.filters.histories import EXACT, GPB1, GPB2, INTERACTING, MergingRule
 from saltus.filters.imm import imm_filter
 from saltus.filters.moments import Adapt, GaussianSumFilter, MomentFilter
+from saltus.filters.particle import BoundParticleFilter, ParticleFilter
 from saltus.filters.rao_blackwell import particle_filter
 from saltus.filters.run import IMM, Record
 from saltus.filters.steps import Belief
@@ -21,6 +22,7 @@ __all__ = [
     "Adapt",
     "Bank",
     "Belief",
+    "BoundParticleFilter",
     "Estimates",
     "ExactFilter",
     "GaussianSumFilter",
@@ -28,6 +30,7 @@ __all__ = [
     "GridFilter",
     "MergingRule",
     "MomentFilter",
+    "ParticleFilter",
     "Record",
     "augmented_filter",
     "coloured_filter",

@@ -16,7 +16,7 @@ from saltus.models.exponential import discretise, exponential
 from saltus.models.findings import Finding
 from saltus.models.gaussian import Gaussian
 from saltus.models.hybrid import HybridModel
-from saltus.models.lowering import as_diffusion
+from saltus.models.lowering import as_diffusion, as_diffusion_sensor
 from saltus.models.motion import Motion, constant_acceleration, constant_velocity, singer
 from saltus.models.noise import MarkovNoise, first_order, second_order
 from saltus.models.nonlinear import FunctionSensor
@@ -53,6 +53,7 @@ __all__ = [
     "SwitchingSDE",
     "Treatment",
     "as_diffusion",
+    "as_diffusion_sensor",
     "augmented",
     "constant_acceleration",
     "constant_velocity",

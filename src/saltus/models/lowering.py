@@ -16,7 +16,7 @@ from saltus.models.hybrid import HybridModel
 from saltus.models.motion import Motion
 from saltus.models.sensors import BoundSensor
 
-__all__ = ["as_diffusion"]
+__all__ = ["as_diffusion", "as_diffusion_sensor"]
 
 
 def as_diffusion(model: HybridModel, sensor: str | Sequence[str] | None = None) -> tuple[SwitchingSDE, DiffusionSensor]:
@@ -51,6 +51,15 @@ def as_diffusion(model: HybridModel, sensor: str | Sequence[str] | None = None) 
         cov0=np.stack([_of_mode(cov, m, 2) for m in modes]),
     )
     return lowered, _sensor(model, sensor, modes)
+
+
+def as_diffusion_sensor(model: HybridModel, sensor: str | Sequence[str] | None = None) -> DiffusionSensor:
+    """The sensor part of `as_diffusion`, for any motion and any chains.
+
+    Raises:
+        ModelError: no such sensor, or one that depends on t or moves.
+    """
+    return _sensor(model, sensor, list(np.ndindex(model.sizes)))
 
 
 def _sde(model: HybridModel) -> LinearSDE:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from saltus.errors import ModelError
 from saltus.models import DiffusionSensor, SwitchingSDE
 
-__all__ = ["DiffusionDraws", "simulate_diffusion"]
+__all__ = ["DiffusionDraws", "advance", "simulate_diffusion"]
 
 _Array = npt.NDArray[np.float64]
 
@@ -82,6 +82,27 @@ def simulate_diffusion(
         modes[:, k], states[:, k] = mode, x
         z[:, k] += _measured(sensor, mode, x, noise.seen[:, k], dt)
     return DiffusionDraws(modes, states, z)
+
+
+def advance(
+    model: SwitchingSDE, mode: npt.NDArray[np.int64], x: _Array, dt: float, substeps: int, rng: np.random.Generator
+) -> tuple[npt.NDArray[np.int64], _Array]:
+    """Move states (k, n) and their modes (k,) over an interval by Euler-Maruyama steps, as `simulate_diffusion` does.
+
+    Args:
+        model: the diffusion.
+        mode: mode of each state.
+        x: states.
+        dt: interval, s.
+        substeps: Euler steps.
+        rng: source of randomness.
+    """
+    width = max(model.diffusion_at(i, model.means0[i]).shape[-1] for i in range(model.n_modes))
+    for _ in range(substeps):
+        moved = x + _step(model, mode, x, rng.standard_normal((len(x), width)), dt / substeps)
+        uniform, anew = rng.uniform(size=len(x)), rng.standard_normal(x.shape)
+        mode, x = _switched(model, mode, x, moved, uniform, anew, dt / substeps)
+    return mode, x
 
 
 def _drawn(
