@@ -11,6 +11,7 @@ WORDS = {
     "info": "what is in a recording",
     "score": "tracks against the truth",
     "diagnose": "what noise a recording has",
+    "gap": "how far a filter is from the optimum",
     "summary": "a run in numbers",
     "report": "one page of HTML",
     "config": "the TOML configuration",

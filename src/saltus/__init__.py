@@ -25,6 +25,7 @@ _EXPORTS = {
     "decide": "saltus.decisions",
     "exact_filter": "saltus.filters",
     "identification_llr": "saltus.identify",
+    "optimality_gap": "saltus.gap",
     "p_correct": "saltus.identify",
     "p_false": "saltus.identify",
     "singer": "saltus.models",

@@ -146,6 +146,46 @@ def demo(output: Path, seed: int) -> None:
     run_demo(output, seed)
 
 
+@main.command()
+@click.argument("model", type=_FILE)
+@click.option("--runs", type=click.IntRange(min=2), default=100, show_default=True, help="Simulated runs.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--fast", type=click.Choice(["IMM", "GPB1", "GPB2"]), default="IMM", show_default=True)
+@click.option(
+    "--reference",
+    type=click.Choice(["auto", "exact", "particles"]),
+    default="auto",
+    show_default=True,
+    help="auto: exact enumeration where few histories of modes are possible, else particles.",
+)
+@click.option("--particles", type=click.IntRange(min=16), default=2000, show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON in place of the table.")
+@click.option("-o", "--output", type=_FILE, help="Write JSON to this file.")
+def gap(
+    model: Path,
+    runs: int,
+    seed: int,
+    fast: str,
+    reference: str,
+    particles: int,
+    as_json: bool,
+    output: Path | None,
+) -> None:
+    """Say how far the fast filter is from the optimum for the model in MODEL (TOML)."""
+    from saltus.gap.command import show_gap
+
+    show_gap(
+        model,
+        runs=runs,
+        seed=seed,
+        fast=fast,
+        reference=reference,
+        particles=particles,
+        as_json=as_json,
+        output=output,
+    )
+
+
 @main.group()
 def diagnose() -> None:
     """Say what a sensor's errors are like, from data."""
