@@ -48,7 +48,8 @@ sanitize: $(READY)
 	LD_PRELOAD="$$($${CXX:-g++} -print-file-name=libasan.so) $$($${CXX:-g++} -print-file-name=libstdc++.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 SALTUS_REQUIRE_NATIVE=1 \
 	  PYTHONPATH="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" \
-	  build/sanitize/bin/python -m pytest tests/native tests/filters/test_imm.py tests/filters/test_bank.py
+	  build/sanitize/bin/python -m pytest tests/native tests/filters/test_imm.py tests/filters/test_bank.py \
+	  tests/filters/test_coloured.py
 
 $(READY): pyproject.toml $(NATIVE)
 	$(PYTHON) -m venv $(VENV)

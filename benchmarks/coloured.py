@@ -3,8 +3,11 @@
     python benchmarks/coloured.py [-o results.json] [--recordings FOLDER]
 
 Simulated: position(s) and velocities of a point whose acceleration has two levels, and whose noise has two; 4 modes,
-at n = 2, m = 1 and n = 4, m = 2. RMSE, NEES and time per step of one run (batch of 256, NumPy on one core, best of
-three) at several correlation times of the noise. FOLDER holds `mlat.ast`, `adsb_v023.ast` and `sensors.toml` of an
+at n = 2, m = 1 and n = 4, m = 2. RMSE, NEES and time per step of one run (batch of 256 on one core, the definition in
+NumPy and the compiled kernel) at several correlation times of the noise. Then the two ways in the kernel alone: time
+per step with all rows kept and with the last only, samples complete, and with one sample in a thousand missing, or one
+in five. Augmentation is `imm_filter` on the augmented state. Contenders take turns; the fastest of several counts, in
+processor time. FOLDER holds `mlat.ast`, `adsb_v023.ast` and `sensors.toml` of an
 airport: multilateration is filtered with ADS-B as truth, its noise as `saltus diagnose noise` finds it, or white of
 the same strength.
 """
@@ -34,6 +37,7 @@ from saltus.models import (
 from saltus.simulate import simulate_hybrid
 
 BATCH, STEPS, DT = 256, 100, 1.0
+LONG = 1000  # steps where the kernel alone is timed, so that the call costs nothing
 ACCEL, LEVEL = np.array([0.1, 2.0]), np.array([1.0, 4.0])  # (m/s^2)^2 / Hz, m
 TRANS = [np.array([[0.95, 0.05], [0.1, 0.9]])] * 2
 TAUS = (0.2, 1.0, 5.0, 25.0, 125.0)
@@ -56,26 +60,26 @@ def description(axes, tau):
     }
 
 
-def simulated(axes, tau, missing):
+def simulated(axes, tau, missing, n_steps=STEPS):
     """Truth (B, K, n) and measurements (B, K+1, m) of the augmented model."""
     d = description(axes, tau)
-    a = augment(**d, dt=DT, n_steps=STEPS, n_chains=2)
-    shape = (STEPS + 1, 2, 2, 3 * axes, 3 * axes)
+    a = augment(**d, dt=DT, n_steps=n_steps, n_chains=2)
+    shape = (n_steps + 1, 2, 2, 3 * axes, 3 * axes)
     F, Q = np.broadcast_to(a.F, shape).copy(), np.broadcast_to(a.Q, shape).copy()
     F[0], Q[0] = np.eye(3 * axes), 0.0
-    trans = [np.concatenate([np.eye(2)[None], np.broadcast_to(t, (STEPS, 2, 2))]) for t in TRANS]
+    trans = [np.concatenate([np.eye(2)[None], np.broadcast_to(t, (n_steps, 2, 2))]) for t in TRANS]
     H = np.concatenate([a.H, a.L], axis=1)
     rng = np.random.default_rng(1)
     draws = simulate_hybrid(
         F=F, Q=Q, H=H.reshape(1, 1, axes, -1), R=np.zeros((1, 1, axes, axes)), trans=trans, mean0=a.mean0,
-        cov0=a.cov0, probs0=PROBS0, n_steps=STEPS + 1, rng=rng, batch=BATCH,
+        cov0=a.cov0, probs0=PROBS0, n_steps=n_steps + 1, rng=rng, batch=BATCH,
     )  # fmt: skip
     z = draws.z.copy()
     z[rng.random(z.shape) < missing] = np.nan
     return d, a, draws.states[:, 1:, : 2 * axes], z
 
 
-def taken_for_white(d, z):
+def taken_for_white(d, z, backend):
     """The multimode filter with white noise of the same variance, from the first sample on."""
     Phi, Q = discretise(d["F"], d["G"], DT)
     rows, n, m = z.shape[1], Phi.shape[-1], z.shape[-1]
@@ -85,35 +89,60 @@ def taken_for_white(d, z):
     trans = [np.concatenate([np.eye(2)[None], np.broadcast_to(t, (rows - 1, 2, 2))]) for t in TRANS]
     return imm_filter(
         z, F=F, Q=Q, H=d["H"].reshape(1, 1, m, n), R=d["noise_cov0"], trans=trans, mean0=d["mean0"], cov0=d["cov0"],
-        probs0=PROBS0, backend="numpy",
+        probs0=PROBS0, backend=backend, num_threads=1,
     )  # fmt: skip
 
 
-def timed(run):
-    """Result, and microseconds per run and step: the best of three."""
-    best = np.inf
-    for _ in range(3):
-        began = time.perf_counter()
-        result = run()
-        best = min(best, time.perf_counter() - began)
-    return result, 1e6 * best / BATCH / STEPS
+def timed(runs, repeats=3):
+    """Results, and seconds of processor time, the least of each: contenders take turns."""
+    best, results = np.full(len(runs), np.inf), [None] * len(runs)
+    for _ in range(repeats):
+        for i, run in enumerate(runs):
+            began = time.process_time()
+            results[i] = run()
+            best[i] = min(best[i], time.process_time() - began)
+    return results, best
 
 
 def compare(axes, tau, missing):
     d, a, truth, z = simulated(axes, tau, missing)
     ways = {
-        "differencing": (2 * axes, lambda: run_differenced(z, a, TRANS, PROBS0)),
-        "augmentation": (3 * axes, lambda: run_augmented(z, a, TRANS, PROBS0, backend="numpy")),
-        "taken for white": (2 * axes, lambda: taken_for_white(d, z)),
+        "differencing": (
+            2 * axes,
+            lambda backend: run_differenced(z, a, TRANS, PROBS0, backend=backend, num_threads=1),
+        ),
+        "augmentation": (3 * axes, lambda backend: run_augmented(z, a, TRANS, PROBS0, backend=backend, num_threads=1)),
+        "taken for white": (2 * axes, lambda backend: taken_for_white(d, z, backend)),
     }
     rows = []
     for name, (dimension, run) in ways.items():
-        est, cost = timed(run)
+        (est, _), cost = timed([lambda way=run, b=backend: way(b) for backend in ("numpy", "native")])
         error = truth - est.mean[:, -STEPS:]
         honesty = nees(error, est.cov[:, -STEPS:]).mean() / (2 * axes)
         position = float(np.sqrt(np.square(error[..., ::2]).mean()))
         speed = float(np.sqrt(np.square(error[..., 1::2]).mean()))
-        rows.append([axes, tau, missing, name, dimension, position, speed, float(honesty), cost])
+        rows.append(
+            [axes, tau, missing, name, dimension, position, speed, float(honesty), *(1e6 * cost / BATCH / STEPS)]
+        )
+    return rows
+
+
+def in_kernel(axes):
+    """Microseconds per step of differencing and of augmentation in the compiled kernel, and their ratio."""
+    rows = []
+    for missing in (0.0, 0.001, 0.2):
+        _, a, _, z = simulated(axes, 5.0, missing, LONG)
+        later, n = np.ascontiguousarray(z[:, 1:]), 3 * axes
+        H, R = np.concatenate([a.H, a.L], axis=1).reshape(1, 1, axes, n), np.zeros((1, 1, axes, axes))
+        for keep in ("all", "last"):
+            settings = {"keep": keep, "backend": "native", "num_threads": 1}
+            model = {"F": a.F, "Q": a.Q, "H": H, "R": R, "trans": TRANS, "mean0": a.mean0, "cov0": a.cov0}
+            runs = [
+                lambda s=settings, z=z, a=a: run_differenced(z, a, TRANS, PROBS0, **s),
+                lambda s=settings, m=model, z=later: imm_filter(z, **m, probs0=PROBS0, **s),
+            ]
+            cost = 1e6 * timed(runs, repeats=7)[1] / BATCH / LONG
+            rows.append([2 * axes, axes, missing, keep, *cost, cost[0] / cost[1]])
     return rows
 
 
@@ -178,9 +207,13 @@ def main():
     rows = [row for axes in (1, 2) for tau in TAUS for row in compare(axes, tau, 0.0)]
     rows += [row for axes in (1, 2) for row in compare(axes, 5.0, 0.2)]
     print(f"{platform.machine()}, Python {platform.python_version()}, NumPy {np.__version__}, one core")
-    head = ["axes", "tau_s", "missing", "way", "dimension", "rmse_x", "rmse_v", "nees/n", "us_per_step"]
+    head = ["axes", "tau_s", "missing", "way", "dimension", "rmse_x", "rmse_v", "nees/n", "us_numpy", "us_kernel"]
     table(head, rows)
     results = {"simulated": [dict(zip(head, row, strict=True)) for row in rows]}
+    rows = [row for axes in (1, 2) for row in in_kernel(axes)]
+    head = ["n", "m", "missing", "keep", "us_differencing", "us_augmentation", "ratio"]
+    table(head, rows)
+    results["kernel"] = [dict(zip(head, row, strict=True)) for row in rows]
     if args.recordings:
         rows = recorded(args.recordings)
         head = ["phase", "noise", "accel", "rmse_m", "nees/2", "nis/2", "log_f_per_report"]

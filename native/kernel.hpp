@@ -23,9 +23,15 @@ enum Status : int { kFine = 0, kNotPositive = 1, kInfinite = 2, kDoubtful = 4 };
 struct Problem {
   std::ptrdiff_t n_tracks = 0, n_steps = 0;
   int n = 0, m = 0, modes = 1, chains = 0;
+  int reported = 0;  // the moments of the first components only are written
+  int start = 0;  // 1: the prior holds at the first measurement, and arrays over intervals begin with the second
+  // 0, or m where from the first measurement on the state is `map` times that of the prior, and its last m components
+  // are what is measured, without noise: they leave while known. H, R and d are those of the first measurement, and Q
+  // has rows [Q | cov(e, f) | M] of `advance`.
+  int known = 0;
   const int* sizes = nullptr;
   const double* z = nullptr;  // (tracks, T, m), NaN where missing
-  Model F, b, Q, H, d, R;
+  Model F, b, Q, H, d, R, map;
   const Model* trans = nullptr;  // one per chain; data is null where the chain cannot switch
   Model log_probs0, mean0, cov0;
   bool every = true;  // all rows, or the last one only

@@ -1,7 +1,7 @@
 // P(modes) of the lanes of one block, linear while that is safe and in logs when it is not.
 #pragma once
 
-#include "step.hpp"
+#include "measure.hpp"
 
 namespace saltus::SALTUS_NS {
 
@@ -25,23 +25,22 @@ inline void into_logs(V* law, int modes) {
 
 // Bayes' rule with every number of a moderate size; false, and nothing changed, when some lane needs logs.
 inline bool reweigh_linear(V* law, int modes, int size, const V* report, V seen, V* heap, V& evidence) {
-  V least = splat(__builtin_inf());
-  for (int j = 0; j < modes; ++j) least = minimum(select(law[j] > 0.0, report[j * size], least), least);
-  V sum{};
+  const V never = splat(__builtin_inf());
+  V least = never;
+  for (int j = 0; j < modes; ++j) least = minimum(select(law[j] > 0.0, report[j * size], never), least);
+  V sum{}, weakest = never;
   for (int j = 0; j < modes; ++j) {
     const V* r = report + j * size;
-    heap[j] = law[j] * square_root(r[1]) * exponential(minimum(-0.5 * (r[0] - least), V{}));
-    sum += heap[j];
+    const V joint = law[j] * square_root(r[1]) * exponential(minimum(-0.5 * (r[0] - least), V{}));
+    weakest = minimum(select(law[j] > 0.0, joint, never), weakest);
+    sum += joint;
+    heap[j] = joint;
   }
-  const V floor = sum * 1e-200;
-  I weak = ~((sum > 1e-250) & (sum < 1e250));
-  for (int j = 0; j < modes; ++j) weak |= (heap[j] < floor) & (law[j] > 0.0);
-  if (any(weak)) return false;
-  const V scale = 1.0 / sum;
-  for (int j = 0; j < modes; ++j) {  // a division, rounded as one: the only mode there is has probability 1
-    const V quotient = heap[j] * scale;
-    law[j] = quotient + (heap[j] - quotient * sum) * scale;
-  }
+  const I safe = (sum > 1e-250) & (sum < 1e250) & (weakest >= sum * 1e-200);
+  if (any(~safe)) return false;
+  const V scale = reciprocal(sum);
+  for (int j = 0; j < modes; ++j) law[j] = heap[j] * scale;
+  if (modes == 1) law[0] = splat(1.0);  // not to the last bit: exactly
   evidence = logarithm(sum) - 0.5 * (least + seen * kLog2Pi);
   return true;
 }

@@ -2,67 +2,85 @@
 #pragma once
 
 #include "law.hpp"
-#include "rows.hpp"
+#include "output.hpp"
 #include "stages.hpp"
 
 namespace saltus::SALTUS_NS {
-
-// One output array: `width` doubles per row of a track, gathered from the step's slot of the buffer.
-struct Field {
-  double* out;
-  int width;
-  int* index;  // for all slots of the buffer, so that whole runs of rows are stored at once
-};
 
 class Recursion {
  public:
   Recursion(const Problem& problem, Arena arena)
       : p(problem),
-        n(problem.n),
         m(problem.m),
-        record(n + triangle(n)),
-        steps(stages(n, m)),
+        full(stages(p.n, m)),
+        reduced(stages(p.n - p.known, m)),
         dynamics_by_lane(p.F.row || p.b.row || p.Q.row),
-        sensor_by_lane(p.H.row || p.d.row || p.R.row) {
+        sensor_by_lane(p.H.row || p.d.row || p.R.row),
+        output(problem, arena) {
     divide(arena);
     used_ = arena.used;
-    if (arena.base) plan_output();
   }
 
   std::size_t used() const { return used_; }
 
-  int run(Size first_block, Size last_block) {
-    for (Size block = first_block; block < last_block; ++block) {
-      first = block * W;
-      tracks = p.n_tracks - first < W ? int(p.n_tracks - first) : W;
-      load_prior();
-      for (Size k = 0; k < p.n_steps; ++k) {
-        const int slot = int(k % W);
-        if (slot == 0) load_measurements(k);
-        predict(k);
-        const bool keep = p.every || k == p.n_steps - 1;
-        V* out = buffer + slot * slot_size;
-        update(k, slot, keep, out);
-        if (keep) output(out);
-        store_steps(k, slot);
-      }
-    }
-    return status;
+  // The stages of step k, in this order, for the block that `begin` named.
+  void begin(Size block) {
+    first = block * W;
+    tracks = p.n_tracks - first < W ? int(p.n_tracks - first) : W;
+    load_prior();
   }
 
- private:
-  static constexpr int kFields = 6, kLikelihood = 5;  // mean, cov, probs, nis, n_observed, log_likelihood
+  void predict(Size k) {
+    if (k % W == 0) load_measurements(k);
+    read_measurement(k);
+    if (k >= p.start) mix(k - p.start);
+  }
 
+  void update(Size k) {
+    const Size moved = k - p.start;  // the row of the dynamics; none where the prior holds at the first measurement
+    I bad;
+    if (p.known && moved >= 0) {
+      if (n < p.n && !complete) widen();
+      bad = advance(moved);
+    } else {
+      if (moved >= 0) propagate(moved);
+      bad = measure(k);
+      if (p.known) full.shared.propagate(state, n, p.modes, shared(p.map, 0), {}, {nothing, none, 0}, heap);
+    }
+    if (p.known) settle();
+    if (any(bad)) status |= kNotPositive;
+  }
+
+  void weigh(Size k) {
+    const bool keep = p.every || k == p.n_steps - 1;
+    V* out = output.slot(k);
+    output.n_observed(out) = seen;
+    if (keep) {
+      probabilities(law, logs, p.modes, probs);
+      output.nis(out) = full.nis(report, probs, m, p.modes, heap);
+    }
+    output.log_likelihood(out) = reweigh(law, logs, p.modes, m, report, seen, heap);
+  }
+
+  void keep(Size k) {
+    if (p.every || k == p.n_steps - 1) collapse(output.slot(k));
+    output.store(state, n, first, tracks, k);
+  }
+
+  int status = kFine;
+
+ private:
   void divide(Arena& arena) {
     int largest = 2;
     for (int c = 0; c < p.chains; ++c) largest = p.sizes[c] > largest ? p.sizes[c] : largest;
-    heap = arena.take(heap_size(n, m, largest) + p.modes);
-    state = arena.take(std::size_t(p.modes) * record);
+    heap = arena.take(heap_size(p.n, m, largest) + p.modes);
+    state = arena.take(std::size_t(p.modes) * record_size(p.n));
+    moments = arena.take(record_size(p.n));
     law = arena.take(p.modes);
     probs = arena.take(p.modes);
     report = arena.take(std::size_t(p.modes) * report_size(m));
     z_raw = arena.take(W * m);
-    z = arena.take(m);
+    z = arena.take(m), known = arena.take(m);
     on = arena.take(m);
     F = arena.take(lanes_of(p.F)), b = arena.take(lanes_of(p.b)), Q = arena.take(lanes_of(p.Q));
     H = arena.take(lanes_of(p.H)), d = arena.take(lanes_of(p.d)), R = arena.take(lanes_of(p.R));
@@ -71,37 +89,12 @@ class Recursion {
     for (int c = 0; c < p.chains; ++c)
       if (lanes_of(p.trans[c]) > largest_trans) largest_trans = lanes_of(p.trans[c]);
     trans = arena.take(largest_trans);
-    slot_size = record + p.modes + 3;
-    buffer = arena.take(std::size_t(W) * slot_size);
-    const int widths[kFields] = {n, n * n, p.modes, 1, 1, 1};
-    for (int f = 0; f < kFields; ++f) fields[f] = {nullptr, widths[f], arena.take_ints(std::size_t(W) * widths[f])};
-    if (p.mode_means) {
-      by_mode_fields[0] = {p.mode_means, p.modes * n, arena.take_ints(std::size_t(p.modes) * n)};
-      by_mode_fields[1] = {p.mode_covs, p.modes * n * n, arena.take_ints(std::size_t(p.modes) * n * n)};
-    }
-  }
-
-  void plan_output() {
-    double* const out[kFields] = {p.mean, p.cov, p.probs, p.nis, p.n_observed, p.log_likelihood};
-    for (int slot = 0; slot < W; ++slot) {
-      const int at = slot * slot_size;
-      const int offset[kFields] = {at, at + n, at + record, at + record + p.modes, at + record + p.modes + 1,
-                      at + record + p.modes + 2};
-      for (int f = 0; f < kFields; ++f) {
-        Field& field = fields[f];
-        field.out = out[f];
-        int* index = field.index + slot * field.width;
-        if (f == 1)
-          symmetric_index(n, offset[f], index);
-        else
-          for (int i = 0; i < field.width; ++i) index[i] = offset[f] + i;
-      }
-    }
-    if (!p.mode_means) return;
-    for (int mode = 0; mode < p.modes; ++mode) {
-      for (int i = 0; i < n; ++i) by_mode_fields[0].index[mode * n + i] = mode * record + i;
-      symmetric_index(n, mode * record + n, by_mode_fields[1].index + mode * n * n);
-    }
+    if (!p.known) return;
+    const int size = p.n * p.n, pieces = size / W + 1;
+    nothing = reinterpret_cast<double*>(arena.take(pieces));
+    none = arena.take_ints(p.modes);
+    for (int i = 0; arena.base && i < size; ++i) nothing[i] = 0.0;
+    for (int i = 0; arena.base && i < p.modes; ++i) none[i] = 0;
   }
 
   void load_prior() {
@@ -109,8 +102,9 @@ class Recursion {
     load_model(p.mean0, first, p.n_tracks, 0, mean);
     load_model(p.cov0, first, p.n_tracks, 0, cov);
     load_model(p.log_probs0, first, p.n_tracks, 0, law);
+    n = p.n;
     for (int mode = 0; mode < p.modes; ++mode) {
-      V* x = state + mode * record;
+      V* x = state + mode * record_size(n);
       for (int i = 0; i < n; ++i) {
         x[i] = mean[p.mean0.which[mode] * n + i];
         for (int j = 0; j <= i; ++j) x[n + packed(i, j)] = cov[p.cov0.which[mode] * n * n + i * n + j];
@@ -129,6 +123,20 @@ class Recursion {
     if (any(infinite)) status |= kInfinite;
   }
 
+  void read_measurement(Size k) {
+    I missing{};
+    seen = V{};
+    for (int a = 0; a < m; ++a) {
+      const V value = z_raw[(k % W) * m + a];
+      const I known = value == value;
+      missing |= ~known;
+      z[a] = select(known, value, V{});
+      on[a] = select(known, splat(1.0), V{});
+      seen += on[a];
+    }
+    complete = !any(missing);
+  }
+
   template <class E>
   static ByMode<E> by_mode(const Model& model, const E* data) {
     return {model.data ? data : nullptr, model.which, model.core};
@@ -145,7 +153,9 @@ class Recursion {
     return by_mode<V>(model, staged);
   }
 
-  void predict(Size k) {
+  const Stages& steps() const { return n == p.n ? full : reduced; }
+
+  void mix(Size k) {
     int outer = 1, inner = p.modes;
     for (int c = 0; c < p.chains; ++c, outer *= p.sizes[c - 1]) {
       const int size = p.sizes[c];
@@ -154,80 +164,112 @@ class Recursion {
       if (!t.data) continue;
       if (t.row) {
         load_model(t, first, p.n_tracks, k, trans);
-        steps.lanes.mix(state, law, n, outer, size, inner, trans, logs, heap);
+        steps().lanes.mix(state, law, n, outer, size, inner, trans, logs, heap);
       } else {
-        steps.shared.mix(state, law, n, outer, size, inner, address(t, 0, k), logs, heap);
+        steps().shared.mix(state, law, n, outer, size, inner, address(t, 0, k), logs, heap);
       }
     }
     if (logs) logs = still_in_logs(law, p.modes);
+  }
+
+  void propagate(Size k) {
     if (dynamics_by_lane)
-      steps.lanes.propagate(state, n, p.modes, by_lane(p.F, k, F, 0), by_lane(p.b, k, b, 0), by_lane(p.Q, k, Q, n),
-                            heap);
+      full.lanes.propagate(state, n, p.modes, by_lane(p.F, k, F, 0), by_lane(p.b, k, b, 0), by_lane(p.Q, k, Q, n), heap);
     else
-      steps.shared.propagate(state, n, p.modes, shared(p.F, k), shared(p.b, k), shared(p.Q, k), heap);
+      full.shared.propagate(state, n, p.modes, shared(p.F, k), shared(p.b, k), shared(p.Q, k), heap);
   }
 
-  void update(Size k, int slot, bool keep, V* out) {
-    V seen{};
-    for (int a = 0; a < m; ++a) {
-      const V value = z_raw[slot * m + a];
-      const I known = value == value;
-      z[a] = select(known, value, V{});
-      on[a] = select(known, splat(1.0), V{});
-      seen += on[a];
-    }
-    V *nis = out + record + p.modes, *n_observed = nis + 1, *log_likelihood = nis + 2;
-    *n_observed = seen;
-    I bad;
+  I advance(Size k) {
+    const Stages& s = steps();
+    if (dynamics_by_lane)
+      return (n < p.n ? s.lanes.advance : s.lanes.advance_inside)(state, n, m, p.modes, by_lane(p.F, k, F, 0),
+                                                                  by_lane(p.b, k, b, 0), by_lane(p.Q, k, Q, 0), known,
+                                                                  z, on, report, heap);
+    return (n < p.n ? s.shared.advance : s.shared.advance_inside)(state, n, m, p.modes, shared(p.F, k), shared(p.b, k),
+                                                                  shared(p.Q, k), known, z, on, report, heap);
+  }
+
+  I measure(Size k) {
     if (sensor_by_lane)
-      bad = steps.lanes.update(state, n, m, p.modes, by_lane(p.H, k, H, 0), by_lane(p.d, k, d, 0), by_lane(p.R, k, R, m),
-                               z, on, report, heap);
-    else
-      bad = steps.shared.update(state, n, m, p.modes, shared(p.H, k), shared(p.d, k), shared(p.R, k), z, on, report,
-                                heap);
-    if (any(bad)) status |= kNotPositive;
-    if (keep) {
-      probabilities(law, logs, p.modes, probs);
-      *nis = steps.nis(report, probs, m, p.modes, heap);
+      return full.lanes.update(state, n, m, p.modes, by_lane(p.H, k, H, 0), by_lane(p.d, k, d, 0),
+                               by_lane(p.R, k, R, m), z, on, report, heap);
+    return full.shared.update(state, n, m, p.modes, shared(p.H, k), shared(p.d, k), shared(p.R, k), z, on, report, heap);
+  }
+
+  // What is measured are the last components of the state: take them back in, as known as the last row left them.
+  void widen() {
+    const int kept = n, size = record_size(p.n);
+    for (int mode = p.modes - 1; mode >= 0; --mode) {
+      const V* source = state + mode * record_size(kept);
+      V *x = state + mode * size, *P = x + p.n;
+      for (int i = triangle(kept) - 1; i >= 0; --i) P[i] = source[kept + i];
+      for (int i = kept - 1; i >= 0; --i) x[i] = source[i];
+      for (int a = 0; a < m; ++a) x[kept + a] = known[a];
+      for (int i = triangle(kept); i < triangle(p.n); ++i) P[i] = V{};
     }
-    *log_likelihood = reweigh(law, logs, p.modes, m, report, seen, heap);
+    n = p.n;
   }
 
-  void output(V* out) {
-    V* law_out = out + record;
-    probabilities(law, logs, p.modes, law_out);
-    steps.collapse(state, law_out, n, p.modes, out, heap);
-  }
-
-  void store_steps(Size k, int slot) {
-    if (p.mode_means && (p.every || k == p.n_steps - 1)) {
-      const Size rows = p.every ? p.n_steps : 1, row = p.every ? k : 0;
-      for (const Field* f = by_mode_fields; f < by_mode_fields + 2; ++f)
-        store_lanes(state, f->index, f->width, f->out + (first * rows + row) * f->width, rows * f->width, tracks);
+  // Drop them where all of them are known in every lane; else give what was seen its value and no variance, which
+  // rounding must not make uncertain again, and round the variance of the others up: x and y move together in a gap,
+  // and rounding must not make them more alike than they can be.
+  void settle() {
+    const int kept = p.n - p.known, size = record_size(p.n);
+    for (int a = 0; a < m; ++a) known[a] = z[a];
+    if (n < p.n) return;
+    if (complete) {
+      for (int mode = 0; mode < p.modes; ++mode)
+        leading(state + mode * size, p.n, state + mode * record_size(kept), kept);
+      n = kept;
+      return;
     }
-    if (slot != W - 1 && k != p.n_steps - 1) return;
-    store_field(fields[kLikelihood], k - slot, slot + 1, p.n_steps, 0);
-    if (p.every)
-      for (int f = 0; f < kLikelihood; ++f) store_field(fields[f], k - slot, slot + 1, p.n_steps, 0);
-    else if (k == p.n_steps - 1)
-      for (int f = 0; f < kLikelihood; ++f) store_field(fields[f], 0, 1, 1, slot);
+    for (V* x = state; x < state + p.modes * size; x += size)
+      for (int a = 0; a < m; ++a) {
+        const int i = kept + a;
+        const V unseen = 1.0 - on[a];
+        x[i] = select(on[a] != 0.0, z[a], x[i]);
+        for (int j = 0; j < p.n; ++j) x[p.n + packed(i, j)] *= unseen;
+        x[p.n + packed(i, i)] *= 1.0 + 0x1p-48;
+      }
   }
 
-  void store_field(const Field& f, Size row, int slots, Size rows, int from_slot) {
-    store_lanes(buffer, f.index + from_slot * f.width, slots * f.width, f.out + (first * rows + row) * f.width,
-                rows * f.width, tracks);
+  void collapse(V* out) {
+    probabilities(law, logs, p.modes, output.probs(out));
+    V* target = n == p.reported ? out : moments;
+    steps().collapse(state, output.probs(out), n, p.modes, target, heap);
+    if (target == moments) leading(moments, n, out, p.reported);
   }
 
   const Problem& p;
-  const int n, m, record;
-  const Stages steps;
+  const int m;
+  const Stages full, reduced;  // for all of the state, and for what is kept while the measured components are known
   const bool dynamics_by_lane, sensor_by_lane;
+  Output output;
   Size first = 0;
-  int tracks = W, status = kFine, slot_size = 0;
+  int tracks = W, n = 0;  // n components are in the records now
   std::size_t used_ = 0;
-  bool logs = true;
-  V *heap, *state, *law, *probs, *report, *z_raw, *z, *on, *F, *b, *Q, *H, *d, *R, *prior, *trans, *buffer;
-  Field fields[kFields], by_mode_fields[2];
+  bool logs = true, complete = false;
+  V seen{};
+  V *heap, *state, *moments, *law, *probs, *report, *z_raw, *z, *known, *on, *F, *b, *Q, *H, *d, *R, *prior, *trans;
+  double* nothing = nullptr;  // a covariance of zero, in every mode
+  int* none = nullptr;
 };
+
+// Two blocks take turns, stage by stage: one's arithmetic fills the gaps that the other's chain of results leaves.
+inline int run(const Problem& p, Size first_block, Size last_block, Arena arena) {
+  Recursion one(p, arena), other(p, {arena.base + one.used()});
+  for (Size block = first_block; block < last_block; block += 2) {
+    Recursion* const pair[2] = {&one, &other};
+    const int blocks = last_block - block > 1 ? 2 : 1;
+    for (int i = 0; i < blocks; ++i) pair[i]->begin(block + i);
+    for (Size k = 0; k < p.n_steps; ++k) {
+      for (int i = 0; i < blocks; ++i) pair[i]->predict(k);
+      for (int i = 0; i < blocks; ++i) pair[i]->update(k);
+      for (int i = 0; i < blocks; ++i) pair[i]->weigh(k);
+      for (int i = 0; i < blocks; ++i) pair[i]->keep(k);
+    }
+  }
+  return one.status | other.status;
+}
 
 }  // namespace saltus::SALTUS_NS

@@ -3,12 +3,22 @@
 
 namespace saltus::SALTUS_NS {
 
+template <int N, int M, class E>
+constexpr StagesOf<E> of() {
+  // Runs that move each in its own way are rare where noise is coloured: sizes known at run time will do.
+  constexpr bool common = sizeof(E) == sizeof(double);
+  constexpr int n = common ? N : 0, m = common ? M : 0;
+  return {mix<N, E>,
+          propagate<N, E>,
+          measure<N, M, E, true>,
+          measure<N, M, E, false>,
+          advance<n, m, E, false>,
+          advance<n, m, E, true>};
+}
+
 template <int N, int M>
 constexpr Stages make() {
-  return Stages{{mix<N, double>, propagate<N, double>, measure<N, M, double, true>, measure<N, M, double, false>},
-                {mix<N, V>, propagate<N, V>, measure<N, M, V, true>, measure<N, M, V, false>},
-                collapse<N>,
-                mixture_nis<M>};
+  return Stages{of<N, M, double>(), of<N, M, V>(), collapse<N>, mixture_nis<M>};
 }
 
 template <int N>

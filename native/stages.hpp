@@ -1,7 +1,7 @@
 // The steps as functions by size: the loops over time and over a bank are compiled once, these once per n and m.
 #pragma once
 
-#include "step.hpp"
+#include "measure.hpp"
 
 namespace saltus::SALTUS_NS {
 
@@ -13,6 +13,11 @@ struct StagesOf {
               V* report, V* heap);
   I (*score)(V* state, int n, int m, int modes, ByMode<E> H, ByMode<E> d, ByMode<E> R, const V* z, const V* on,
              V* report, V* heap);
+  // Where what was measured is known, and left the state; and where it is in the state.
+  I (*advance)(V* state, int n, int m, int modes, ByMode<E> Phi, ByMode<E> b, ByMode<E> noise, const V* known,
+               const V* z, const V* on, V* report, V* heap);
+  I (*advance_inside)(V* state, int n, int m, int modes, ByMode<E> Phi, ByMode<E> b, ByMode<E> noise, const V* known,
+                      const V* z, const V* on, V* report, V* heap);
 };
 
 struct Stages {
@@ -38,7 +43,7 @@ inline Stages stages(int n, int m) {
 // Doubles per lane of scratch that any step may ask for.
 inline std::size_t heap_size(int n, int m, int largest_chain) {
   const std::size_t record = n + triangle(n), K = largest_chain;
-  return K * (K + 1 + record) + 4 * record + 2 * std::size_t(n) * m + 2 * triangle(m) + 8 * m + 8;
+  return K * (K + 1 + record) + 4 * record + 3 * std::size_t(n) * m + 2 * triangle(m) + 8 * m + 8;
 }
 
 }  // namespace saltus::SALTUS_NS

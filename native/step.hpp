@@ -102,15 +102,32 @@ SALTUS_INLINE void mixing_weights(V* law, int stride, int size, const E* trans, 
       mu[i * size + j] = joint + kFloor;
       total += joint + kFloor;
     }
-    V inverse = 1.0 / total;
+    V inverse = reciprocal(total);
     for (int i = 0; i < size; ++i) mu[i * size + j] *= inverse;
     law[j * stride] = logs ? logarithm(q) + top : q;
   }
 }
 
+// The same for a fibre of two modes, kept in registers.
+template <class E>
+SALTUS_INLINE void pair_weights(V& a, V& b, const E* trans, bool logs, V (&mu)[4]) {
+  V top{}, p = a, q = b;
+  if (logs) {
+    top = maximum(a, b);
+    top = select(top > -1e300, top, V{});
+    p = exponential(p - top), q = exponential(q - top);
+  }
+  const V p0 = p * trans[0], p1 = p * trans[1], q0 = q * trans[2], q1 = q * trans[3];
+  a = p0 + q0, b = p1 + q1;
+  if (logs) a = logarithm(a) + top, b = logarithm(b) + top;
+  const V x0 = p0 + kFloor, x1 = p1 + kFloor, y0 = q0 + kFloor, y1 = q1 + kFloor;
+  const V first = reciprocal(x0 + y0), second = reciprocal(x1 + y1);
+  mu[0] = x0 * first, mu[1] = x1 * second, mu[2] = y0 * first, mu[3] = y1 * second;
+}
+
 // Moment matching of two modes, in place: R_j = mu_0j P_0 + mu_1j P_1 + mu_0j mu_1j (x_0 - x_1)(x_0 - x_1)'.
 template <int N>
-SALTUS_INLINE void mix_pair(V* a, V* b, const V* mu, int n, V* heap) {
+SALTUS_INLINE void mix_pair(V* a, V* b, const V (&mu)[4], int n, V* heap) {
   const V a0 = mu[0], a1 = mu[1], b0 = mu[2], b1 = mu[3], c0 = a0 * b0, c1 = a1 * b1;
   Local<N> gap(heap, n);
   each<N>(n, [&](int i) SALTUS_LAMBDA {
@@ -169,16 +186,19 @@ template <int N, class E>
 void mix(V* state, V* law, int size_n, int outer, int size, int inner, const E* trans, bool logs, V* heap) {
   const int n = N > 0 ? N : size_n;
   const long record = n + triangle(n);
-  V* mu = heap;
-  heap += size * size + size;
   for (int o = 0; o < outer; ++o)
     for (int i = 0; i < inner; ++i) {
       const int at = o * size * inner + i;
-      mixing_weights(law + at, inner, size, trans, logs, mu);
-      if (size == 2)
-        mix_pair<N>(state + at * record, state + (at + inner) * record, mu, n, heap);
-      else
-        mix_fibre<N>(state + at * record, inner * record, size, mu, n, heap);
+      V* first = state + at * record;
+      if (size == 2) {
+        V mu[4];
+        pair_weights(law[at], law[at + inner], trans, logs, mu);
+        mix_pair<N>(first, first + inner * record, mu, n, heap);
+      } else {
+        V* mu = heap;
+        mixing_weights(law + at, inner, size, trans, logs, mu);
+        mix_fibre<N>(first, inner * record, size, mu, n, heap + size * size + size);
+      }
     }
 }
 
@@ -241,160 +261,6 @@ void collapse(const V* state, const V* probs, int size_n, int modes, V* out, V* 
     out[i] = x[i];
     upto<N>(i, [&](int j) SALTUS_LAMBDA { out[n + packed(i, j)] = P[packed(i, j)]; });
   });
-}
-
-// What a measurement says of one mode, per mode in `report`: [d2 | 1 / det S | pivots (m) | nu (m) | S packed].
-SALTUS_INLINE constexpr int report_size(int m) { return 2 + 2 * m + triangle(m); }
-
-// Measure and condition every mode (`Gain`), or measure only, in Joseph form.
-//
-//   nu = z - H x - d,  U = P H',  S = H U + R = L D L',  K = U S^-1,  T = P - K U' = (I - K H) P,
-//   P+ = T (I - K H)' + K R K' = T - (T H' - K R) K'.
-//
-// The last form costs n^2 m where the product with I - K H costs n^3, and keeps what makes Joseph's form safe: an
-// error in T is multiplied by (I - K H)', which annihilates it in the measured directions. A component not seen
-// (on = 0) has its row of nu, of L and of D^-1 zero, hence its column of K: no branch. Returns the lanes in which an S
-// was not positive definite.
-template <int N, int M, class E, bool Gain>
-I measure(V* state, int size_n, int size_m, int modes, ByMode<E> H, ByMode<E> d, ByMode<E> R, const V* z, const V* on,
-          V* report, V* heap) {
-  const int n = N > 0 ? N : size_n, m = M > 0 ? M : size_m;
-  const int record = n + triangle(n);
-  constexpr int NM = N * M;
-  I bad{};
-  for (int mode = 0; mode < modes; ++mode, state += record, report += report_size(m)) {
-    V* free = heap;
-    const E *h = H[mode], *r = R[mode];
-    V *x = state, *P = state + n;
-    Local<NM> U(free, n * m);
-    Local<triangle(M)> L(free, triangle(m));
-    Local<M> nu(free, m), inverse(free, m);
-    each<N>(n, [&](int i) SALTUS_LAMBDA {
-      each<M>(m, [&](int a) SALTUS_LAMBDA {
-        V sum = P[packed(i, 0)] * h[a * n];
-        from<N>(1, n, [&](int k) SALTUS_LAMBDA { sum += P[packed(i, k)] * h[a * n + k]; });
-        U[i * m + a] = sum;
-      });
-    });
-    V* S = report + 2 + 2 * m;
-    each<M>(m, [&](int a) SALTUS_LAMBDA {
-      V residual = z[a];
-      if (d.present()) residual -= d[mode][a];
-      each<N>(n, [&](int k) SALTUS_LAMBDA { residual -= x[k] * h[a * n + k]; });
-      nu[a] = residual * on[a];
-      report[2 + m + a] = nu[a];
-      upto<M>(a, [&](int b) SALTUS_LAMBDA {
-        V sum = splat(r[a * m + b]);
-        each<N>(n, [&](int k) SALTUS_LAMBDA { sum += U[k * m + b] * h[a * n + k]; });
-        sum = a == b ? select(on[a] != 0.0, sum, splat(1.0)) : sum * (on[a] * on[b]);
-        L[packed(a, b)] = sum;
-        S[packed(a, b)] = sum;
-      });
-    });
-    // S = L D L' in place: `inverse` is D^-1, 0 where not seen; nu becomes L^-1 nu.
-    V d2{}, inverse_det = splat(1.0);
-    each<M>(m, [&](int a) SALTUS_LAMBDA {
-      const V pivot = L[packed(a, a)];
-      bad |= ~(pivot > 0.0);
-      report[2 + a] = pivot;
-      const V reciprocal = 1.0 / pivot;
-      inverse_det *= reciprocal;
-      inverse[a] = reciprocal * on[a];
-      from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA {
-        const V factor = L[packed(b, a)] * reciprocal;
-        nu[b] -= factor * nu[a];
-        from<M>(a + 1, m, [&](int c) SALTUS_LAMBDA {
-          if (c <= b) L[packed(b, c)] -= factor * L[packed(c, a)];
-        });
-      });
-      from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA { L[packed(b, a)] *= reciprocal; });
-      d2 += nu[a] * nu[a] * inverse[a];
-    });
-    report[0] = d2;
-    report[1] = inverse_det;
-    if constexpr (Gain) {
-      Local<NM> K(free, n * m);
-      Local<N> T(free, n);
-      Local<M> w(free, m);
-      each<N>(n, [&](int i) SALTUS_LAMBDA {
-        each<M>(m, [&](int a) SALTUS_LAMBDA {
-          V g = U[i * m + a];
-          upto<M>(a - 1, [&](int b) SALTUS_LAMBDA { g -= L[packed(a, b)] * w[b]; });
-          w[a] = g;
-        });
-        V moved = x[i];
-        each<M>(m, [&](int a) SALTUS_LAMBDA {
-          w[a] *= inverse[a];
-          moved += w[a] * nu[a];
-        });
-        x[i] = moved;
-        each<M>(m, [&](int back) SALTUS_LAMBDA {
-          const int a = m - 1 - back;
-          V g = w[a];
-          from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA { g -= L[packed(b, a)] * K[i * m + b]; });
-          K[i * m + a] = g;
-        });
-      });
-      // In place: row i writes P[i][j <= i] only, which no later row reads.
-      each<N>(n, [&](int i) SALTUS_LAMBDA {
-        each<N>(n, [&](int j) SALTUS_LAMBDA {
-          V t = P[packed(i, j)];
-          each<M>(m, [&](int a) SALTUS_LAMBDA { t -= K[i * m + a] * U[j * m + a]; });
-          T[j] = t;
-        });
-        each<M>(m, [&](int a) SALTUS_LAMBDA {
-          V g = T[0] * h[a * n];
-          from<N>(1, n, [&](int k) SALTUS_LAMBDA { g += T[k] * h[a * n + k]; });
-          each<M>(m, [&](int b) SALTUS_LAMBDA { g -= K[i * m + b] * r[a * m + b]; });
-          w[a] = g;
-        });
-        upto<N>(i, [&](int j) SALTUS_LAMBDA {
-          V t = T[j];
-          each<M>(m, [&](int a) SALTUS_LAMBDA { t -= w[a] * K[j * m + a]; });
-          P[packed(i, j)] = t;
-        });
-      });
-    }
-  }
-  return bad;
-}
-
-// Squared Mahalanobis distance of the mixture's innovation: nu and S of every mode, weighted by the predicted `probs`.
-template <int M>
-V mixture_nis(const V* report, const V* probs, int size_m, int modes, V* heap) {
-  const int m = M > 0 ? M : size_m;
-  const V* first = report + 2 + m;
-  const int size = report_size(m);
-  Local<M> mean(heap, m), gap(heap, m);
-  Local<triangle(M)> S(heap, triangle(m));
-  each<M>(m, [&](int a) SALTUS_LAMBDA {
-    mean[a] = V{};
-    upto<M>(a, [&](int b) SALTUS_LAMBDA { S[packed(a, b)] = V{}; });
-  });
-  for (int mode = 0; mode < modes; ++mode)
-    each<M>(m, [&](int a) SALTUS_LAMBDA { mean[a] += probs[mode] * first[mode * size + a]; });
-  for (int mode = 0; mode < modes; ++mode) {
-    const V* nu = first + mode * size;
-    const V weight = probs[mode];
-    each<M>(m, [&](int a) SALTUS_LAMBDA { gap[a] = nu[a] - mean[a]; });
-    each<M>(m, [&](int a) SALTUS_LAMBDA {
-      const V scaled = weight * gap[a];
-      upto<M>(a, [&](int b) SALTUS_LAMBDA { S[packed(a, b)] += weight * nu[m + packed(a, b)] + scaled * gap[b]; });
-    });
-  }
-  V d2{};
-  each<M>(m, [&](int a) SALTUS_LAMBDA {
-    const V reciprocal = 1.0 / S[packed(a, a)];
-    d2 += mean[a] * mean[a] * reciprocal;
-    from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA {
-      const V factor = S[packed(b, a)] * reciprocal;
-      mean[b] -= factor * mean[a];
-      from<M>(a + 1, m, [&](int c) SALTUS_LAMBDA {
-        if (c <= b) S[packed(b, c)] -= factor * S[packed(c, a)];
-      });
-    });
-  });
-  return d2;
 }
 
 }  // namespace saltus::SALTUS_NS

@@ -7,7 +7,17 @@ import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
-__all__ = ["law", "problems", "quick", "random_cov", "random_problem", "random_trans", "rngs"]
+__all__ = [
+    "coloured_problems",
+    "law",
+    "problems",
+    "quick",
+    "random_coloured",
+    "random_cov",
+    "random_problem",
+    "random_trans",
+    "rngs",
+]
 
 # The same examples on every machine; a deadline would be a timing assertion.
 quick = settings(max_examples=25, deadline=None, derandomize=True)
@@ -90,3 +100,40 @@ def problems(draw, max_chains=3, max_modes=12, max_batch=2):
     rng = draw(rngs())
     n, m, n_steps = draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 5))
     return random_problem(rng, sizes, n, m, n_steps, batch)
+
+
+def random_coloured(rng, sizes=(2,), n=2, m=1, n_steps=5, batch=(), missing=0.3, irregular=True):
+    """Arguments of `coloured_filter`; each matrix depends on some of the chains."""
+
+    def lead():
+        return tuple(int(rng.choice([1, s])) for s in sizes)
+
+    z = 2.0 * rng.normal(size=(*batch, n_steps + 1, m))
+    z[rng.random(z.shape) < missing] = np.nan
+    eye = np.eye(max(n, m))
+    noise_lead = ((), lead())[rng.integers(2)]
+    n_modes = int(np.prod(sizes))
+    return {
+        "z": z,
+        "F": -0.3 * eye[:n, :n] + 0.5 * rng.normal(size=(*lead(), n, n)),
+        "G": rng.normal(size=(*lead(), n, n)) + 0.3 * eye[:n, :n],
+        "noise_F": -0.8 * eye[:m, :m] + 0.3 * rng.normal(size=(*lead(), m, m)),
+        "noise_G": rng.normal(size=(*lead(), m, m)) + 0.5 * eye[:m, :m],
+        "H": rng.normal(size=(m, n)),
+        "dt": rng.uniform(0.1, 1.5, n_steps) if irregular else 0.7,
+        "trans": [random_trans(rng, s, ((), (n_steps,))[rng.integers(2)]) for s in sizes],
+        "mean0": rng.normal(size=((), (*sizes,))[rng.integers(2)] + (n,)),
+        "cov0": random_cov(rng, ((), lead())[rng.integers(2)], n),
+        "noise_cov0": random_cov(rng, noise_lead, m),
+        "probs0": law(rng, (), n_modes).reshape(sizes),
+    }
+
+
+@st.composite
+def coloured_problems(draw):
+    sizes = tuple(draw(st.lists(st.integers(1, 3), min_size=0, max_size=3)))
+    batch = tuple(draw(st.lists(st.integers(1, 3), min_size=0, max_size=1)))
+    rng = draw(rngs())
+    n, m, n_steps = draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 7))
+    missing = draw(st.sampled_from([0.0, 0.2, 0.7]))
+    return random_coloured(rng, sizes, n, m, n_steps, batch, missing, draw(st.booleans()))

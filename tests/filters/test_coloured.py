@@ -12,8 +12,9 @@ from saltus.filters import imm_filter
 from saltus.filters.coloured import augmented_filter, coloured_filter
 from saltus.filters.coloured_model import augment, difference
 from saltus.metrics import consistency, nees
-from strategies import law, quick, random_cov, random_trans, rngs
+from strategies import coloured_problems, quick, random_coloured, random_cov, random_trans, rngs
 
+BACKENDS = ["numpy", None]  # the definition, and whatever the package chooses where a compiled backend is present
 WAYS = [coloured_filter, augmented_filter]
 CASES = ["coloured_m22_n2", "coloured_m22_n3_missing", "coloured_m32_n3", "coloured_paper"]
 
@@ -34,11 +35,12 @@ def case_arguments(d):
     }
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("name", CASES)
-def test_reference_cases(cases, name, way):
+def test_reference_cases(cases, name, way, backend):
     d = cases(name)
-    est = way(d["Y"], **case_arguments(d), per_mode=True)
+    est = way(d["Y"], **case_arguments(d), per_mode=True, backend=backend)
     found = {
         "P": est.probs,
         "X": est.mode_means,
@@ -76,47 +78,11 @@ def test_reference_discretisation(cases, name):
 # --- random problems ----------------------------------------------------------------------------------------
 
 
-def random_coloured(rng, sizes=(2,), n=2, m=1, n_steps=5, batch=(), missing=0.3, irregular=True):
-    """Arguments of `coloured_filter`; each matrix depends on some of the chains."""
-
-    def lead():
-        return tuple(int(rng.choice([1, s])) for s in sizes)
-
-    z = 2.0 * rng.normal(size=(*batch, n_steps + 1, m))
-    z[rng.random(z.shape) < missing] = np.nan
-    eye = np.eye(max(n, m))
-    noise_lead = ((), lead())[rng.integers(2)]
-    n_modes = int(np.prod(sizes))
-    return {
-        "z": z,
-        "F": -0.3 * eye[:n, :n] + 0.5 * rng.normal(size=(*lead(), n, n)),
-        "G": rng.normal(size=(*lead(), n, n)) + 0.3 * eye[:n, :n],
-        "noise_F": -0.8 * eye[:m, :m] + 0.3 * rng.normal(size=(*lead(), m, m)),
-        "noise_G": rng.normal(size=(*lead(), m, m)) + 0.5 * eye[:m, :m],
-        "H": rng.normal(size=(m, n)),
-        "dt": rng.uniform(0.1, 1.5, n_steps) if irregular else 0.7,
-        "trans": [random_trans(rng, s, ((), (n_steps,))[rng.integers(2)]) for s in sizes],
-        "mean0": rng.normal(size=((), (*sizes,))[rng.integers(2)] + (n,)),
-        "cov0": random_cov(rng, ((), lead())[rng.integers(2)], n),
-        "noise_cov0": random_cov(rng, noise_lead, m),
-        "probs0": law(rng, (), n_modes).reshape(sizes),
-    }
-
-
-@st.composite
-def coloured_problems(draw):
-    sizes = tuple(draw(st.lists(st.integers(1, 3), min_size=0, max_size=3)))
-    batch = tuple(draw(st.lists(st.integers(1, 3), min_size=0, max_size=1)))
-    rng = draw(rngs())
-    n, m, n_steps = draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 7))
-    missing = draw(st.sampled_from([0.0, 0.2, 0.7]))
-    return random_coloured(rng, sizes, n, m, n_steps, batch, missing, draw(st.booleans()))
-
-
+@pytest.mark.parametrize("backend", BACKENDS)
 @quick
-@given(coloured_problems())
-def test_differencing_equals_augmentation_for_any_chains_and_gaps(problem):
-    a, b = coloured_filter(**problem, per_mode=True), augmented_filter(**problem, per_mode=True)
+@given(problem=coloured_problems())
+def test_differencing_equals_augmentation_for_any_chains_and_gaps(problem, backend):
+    a, b = (way(**problem, per_mode=True, backend=backend) for way in WAYS)
     for name in ("probs", "mean", "cov", "mode_means", "mode_covs"):
         assert error(getattr(a, name), getattr(b, name)) < 1e-6, name
     scale = 1 + np.abs(b.log_likelihood).max()
@@ -168,11 +134,12 @@ def augmented_problem(p):
     }
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @quick
-@given(rngs(), st.integers(1, 3), st.integers(1, 3))
-def test_chains_agree_with_the_textbook_cycle(rng, n, m):
+@given(rng=rngs(), n=st.integers(1, 3), m=st.integers(1, 3))
+def test_chains_agree_with_the_textbook_cycle(rng, n, m, backend):
     p = random_coloured(rng, (2, 2), n, m, n_steps=4)
-    est, want = coloured_filter(**p, per_mode=True), textbook_imm(flat_model(augmented_problem(p)))
+    est, want = coloured_filter(**p, per_mode=True, backend=backend), textbook_imm(flat_model(augmented_problem(p)))
     assert error(est.probs.reshape(4, 4), want.probs[1:]) < 1e-8
     assert error(est.mean, want.mean[1:, :n]) < 1e-8
     assert error(est.cov, want.cov[1:, :n, :n]) < 1e-8
@@ -180,16 +147,17 @@ def test_chains_agree_with_the_textbook_cycle(rng, n, m):
     assert np.abs(total - want.log_likelihood).max() < 1e-8 * (1 + np.abs(want.log_likelihood).max())
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @quick
-@given(rngs(), st.integers(1, 4), st.integers(1, 3))
-def test_without_chains_it_is_the_dense_gaussian_answer(rng, n, m):
+@given(rng=rngs(), n=st.integers(1, 4), m=st.integers(1, 3))
+def test_without_chains_it_is_the_dense_gaussian_answer(rng, n, m, backend):
     p = random_coloured(rng, (), n, m, n_steps=6, missing=0.4)
     a = augmented_problem(p)
     T = len(p["z"])
     H, R = np.broadcast_to(a["H"], (T, m, n + m)), np.zeros((T, m, m))
     args = (a["F"], a["Q"], H, R, np.zeros((T, n + m)), np.zeros((T, m)), a["mean0"], a["cov0"])
     mean, cov, total = dense_kalman(p["z"], *args)
-    est = coloured_filter(**p)
+    est = coloured_filter(**p, backend=backend)
     assert error(est.mean, mean[1:, :n]) < 1e-8
     assert error(est.cov, cov[1:, :n, :n]) < 1e-8
     got = np.cumsum(np.concatenate([[est.log_likelihood_start], est.log_likelihood]))
@@ -301,35 +269,38 @@ def white_problem(p, R, bias=None):
     }
 
 
-def test_correlation_time_to_zero_is_white_noise(rng):
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_correlation_time_to_zero_is_white_noise(rng, backend):
     errors = []
     for tau in (0.1, 1e-3, 1e-9):
         p = tracking_problem(rng, tau, sigma=3.0)
-        a, b = coloured_filter(**p), imm_filter(**white_problem(p, 9.0))
+        a, b = coloured_filter(**p, backend=backend), imm_filter(**white_problem(p, 9.0))
         errors.append(max(error(a.mean, b.mean[1:]), error(a.cov, b.cov[1:]), error(a.probs, b.probs[1:])))
     assert errors[0] < 1e-3  # exp(-10) of memory is left
     assert max(errors[1:]) < 1e-8
 
 
-def test_correlation_time_to_infinity_is_a_constant_bias(rng):
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_correlation_time_to_infinity_is_a_constant_bias(rng, backend):
     errors = []
     for tau in (1e4, 1e8, 1e13):
         p = tracking_problem(rng, tau, sigma=3.0)
-        a, b = coloured_filter(**p), imm_filter(**white_problem(p, 0.0, bias=9.0))
+        a, b = coloured_filter(**p, backend=backend), imm_filter(**white_problem(p, 0.0, bias=9.0))
         errors.append(max(error(a.mean, b.mean[1:, :2]), error(a.cov, b.cov[1:, :2, :2]), error(a.probs, b.probs[1:])))
     assert errors[0] > errors[1]
     assert errors[1] < 1e-5 and errors[2] < 1e-6
-    fixed = coloured_filter(**{**p, "noise_F": np.zeros((1, 1, 1)), "noise_G": np.zeros((1, 1, 1))})
+    fixed = coloured_filter(**{**p, "noise_F": np.zeros((1, 1, 1)), "noise_G": np.zeros((1, 1, 1))}, backend=backend)
     assert error(fixed.mean, b.mean[1:, :2]) < 1e-6
 
 
+@pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("tau", [1e-9, 1.0, 1e12])
 @pytest.mark.parametrize("sigma", [1e-9, 1e-4, 1e6])
 @pytest.mark.parametrize("level", [1e-6, 1.0])
-def test_ill_conditioned_problems_stay_finite_and_psd(rng, tau, sigma, level):
+def test_ill_conditioned_problems_stay_finite_and_psd(rng, tau, sigma, level, backend):
     p = tracking_problem(rng, tau, sigma, n_steps=200, level=level)
     p["z"][17:23] = np.nan
-    est = coloured_filter(**p, per_mode=True)
+    est = coloured_filter(**p, per_mode=True, backend=backend)
     for a in (est.probs, est.mean, est.cov, est.log_likelihood, est.mode_covs):
         assert np.isfinite(a).all()
     assert is_psd(est.cov) and is_psd(est.mode_covs)
@@ -421,24 +392,46 @@ def test_wrong_descriptions_are_refused(plain, change, message):
     [
         ({"z": np.zeros((1, 1))}, "K >= 1 rows after it"),
         ({"z": np.array([[0.0], [np.inf], [0.0], [0.0], [0.0]])}, r"z\[1, 0\] is infinite"),
+        ({"z": np.array([[-np.inf], [0.0], [0.0], [0.0], [0.0]])}, r"z\[0, 0\] is infinite"),
         ({"dt": np.ones(5)}, r"dt has shape \(5,\); z has 5 rows"),
     ],
 )
-def test_wrong_data_are_refused(plain, change, message):
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_wrong_data_are_refused(plain, change, message, backend, way):
     with pytest.raises(DataError, match=message):
-        coloured_filter(**{**plain, **change})
+        way(**{**plain, **change}, backend=backend)
 
 
-def test_two_samples_at_one_time_are_refused_and_two_components_are_not(rng):
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("way", WAYS)
+def test_the_last_row_alone(rng, way, backend):
+    p = random_coloured(rng, (2, 2), 3, 2, 6, batch=(3,))
+    every = way(**p, per_mode=True, backend=backend)
+    last = way(**p, per_mode=True, keep="last", backend=backend)
+    np.testing.assert_array_equal(last.log_likelihood, every.log_likelihood)
+    np.testing.assert_array_equal(last.log_likelihood_start, every.log_likelihood_start)
+    for name in ("probs", "mean", "cov", "nis", "n_observed", "mode_means", "mode_covs"):
+        np.testing.assert_array_equal(getattr(last, name), getattr(every, name)[:, -1:], err_msg=name)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_no_threads_are_refused(plain, way):
+    with pytest.raises(ModelError, match="num_threads is at least 1"):
+        way(**plain, num_threads=0)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_two_samples_at_one_time_are_refused_and_two_components_are_not(rng, backend):
     p = random_coloured(rng, (2,), 2, 2, 2, missing=0.0)
     p["dt"] = np.array([0.5, 0.0])
     with pytest.raises(NumericalError, match="Two samples at one time"):
-        coloured_filter(**p)
+        coloured_filter(**p, backend=backend)
     p["z"][1, 1] = p["z"][2, 0] = np.nan
     P = random_trans(rng, 2)
-    apart = coloured_filter(**{**p, "trans": [np.stack([P, np.eye(2)])]})
+    apart = coloured_filter(**{**p, "trans": [np.stack([P, np.eye(2)])]}, backend=backend)
     both = np.array([p["z"][0], [p["z"][1, 0], p["z"][2, 1]]])
-    together = coloured_filter(**{**p, "z": both, "dt": 0.5, "trans": [P]})
+    together = coloured_filter(**{**p, "z": both, "dt": 0.5, "trans": [P]}, backend=backend)
     np.testing.assert_allclose(apart.mean[-1], together.mean[-1], rtol=1e-9)
     np.testing.assert_allclose(apart.probs[-1], together.probs[-1], rtol=1e-9)
     np.testing.assert_allclose(apart.log_likelihood.sum(), together.log_likelihood.sum(), rtol=1e-9)

@@ -137,7 +137,7 @@ def test_arguments(problem, monkeypatch):
 def test_the_binding_itself_checks_what_it_is_given(problem):
     model = {k: np.ones((1, 1, 1, 1)) for k in ("F", "Q", "H", "R")}
     model.update(n=1, sizes=[], b=None, d=None, mean0=np.ones((1, 1)), cov0=np.ones((1, 1, 1)))
-    model.update(log_probs0=np.zeros(1), trans=[])
+    model.update(log_probs0=np.zeros(1), trans=[], reported=1, from_first=False, map=None)
     out = {name: np.empty(2) for name in ("probs", "mean", "cov", "nis", "n_observed", "log_likelihood")}
     out.update(mode_means=None, mode_covs=None)
     z = np.zeros((1, 2, 1))

@@ -2,9 +2,14 @@
 
 import logging
 import os
+from collections.abc import Sequence
 from functools import cache
+from math import prod
 from types import ModuleType
 from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
 
 from saltus.errors import ModelError
 
@@ -12,6 +17,8 @@ __all__ = [
     "MOST_MODES",
     "MOST_STATES",
     "Backend",
+    "check_settings",
+    "fits_kernel",
     "instruction_set",
     "native_module",
     "system_report",
@@ -59,6 +66,24 @@ def use_native(backend: Backend | None) -> bool:
             'Install one and reinstall saltus, or use backend="numpy".'
         )
     return False
+
+
+def check_settings(keep: str, num_threads: int | None) -> None:
+    """Check what the batch filters have in common.
+
+    Raises:
+        ModelError: another `keep` than "all" and "last", or no thread.
+    """
+    if keep not in ("all", "last"):
+        raise ModelError(f'keep is "all" or "last", not {keep!r}.')
+    if num_threads is not None and num_threads < 1:
+        raise ModelError(f"num_threads is at least 1, not {num_threads}.")
+
+
+def fits_kernel(state: npt.ArrayLike, z: npt.ArrayLike, trans: Sequence[npt.ArrayLike]) -> bool:
+    """Say whether the sizes, the last axes of these arrays, are within the limits of the compiled kernel."""
+    n, m, *sizes = (prod(np.shape(a)[-1:]) for a in (state, z, *trans))
+    return n <= MOST_STATES and m <= MOST_STATES and prod(sizes) <= MOST_MODES
 
 
 def instruction_set() -> str:

@@ -20,11 +20,11 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.errors import DataError, ModelError
-from saltus.linalg import block_diagonal
+from saltus.linalg import block_diagonal, quadratic_form
 from saltus.models import discretise
 from saltus.models.checks import FloatArray, covariance, intervals, numbers
 
-__all__ = ["Augmented", "Differenced", "augment", "difference"]
+__all__ = ["Augmented", "Differenced", "augment", "difference", "factored"]
 
 
 class Augmented(NamedTuple):
@@ -79,6 +79,33 @@ def difference(model: Augmented) -> Differenced:
     B = T @ model.Q @ T.T
     b = None if model.b is None else np.asarray(model.b @ T.T)
     return Differenced(T @ model.F @ back, 0.5 * (B + B.swapaxes(-1, -2)), b, T, n + p - m)
+
+
+def factored(model: Augmented, moves: Differenced) -> FloatArray:
+    """Split the noise of s = (x, E u, y) into what its measured part tells and the rest, as rows [Q | cov(e, f) | M].
+
+    e = M u + v,   f = M_f u,   cov u = I,   cov v = Q = (I - J C) B_a (I - J C)' on the kept components, 0 on y
+
+    with B_a and C = [H L] the noise and the measurement of a = (x, u), N_ff = C B_a C' = M_f M_f' and J = N_ef N_ff^-1.
+    A direction of y without noise has none in e either, and gets a column of zeros in M.
+
+    Returns:
+        (T?, M1|1, ..., MC|1, n+p, n+p+2m), what the compiled kernel takes for Q.
+    """
+    kept, C = moves.n_kept, moves.T[moves.n_kept :]
+    N_ef, N_ff = moves.B[..., kept:], moves.B[..., kept:, kept:]
+    scale = np.sqrt(np.diagonal(N_ff, axis1=-2, axis2=-1))
+    scale = np.where(scale > 0, scale, 1.0)
+    values, V = np.linalg.eigh(N_ff / (scale[..., :, None] * scale[..., None, :]))
+    root = np.sqrt(np.where(values > 1e-14, values, 0.0))
+    inverse = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0)
+    whiten = V / scale[..., :, None] * inverse[..., None, :]
+    M = N_ef @ whiten
+    M[..., kept:, :] = scale[..., :, None] * V * root[..., None, :]
+    J = (M @ whiten.swapaxes(-1, -2))[..., :kept, :]
+    rest = np.zeros_like(moves.B)
+    rest[..., :kept, :kept] = quadratic_form(moves.T[:kept] - J @ C, model.Q)
+    return np.concatenate([rest, N_ef, M], axis=-1)
 
 
 def _split(L: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -2,16 +2,14 @@
 
 from collections.abc import Sequence
 from functools import partial
-from math import prod
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from saltus.errors import ModelError
 from saltus.filters import steps
 from saltus.filters.align import Aligned, align
-from saltus.filters.backend import MOST_MODES, MOST_STATES, Backend, use_native
+from saltus.filters.backend import Backend, check_settings, fits_kernel, use_native
 from saltus.filters.estimates import Estimates
 
 __all__ = ["imm_filter"]
@@ -73,25 +71,17 @@ def imm_filter(
 
     Source: Detkov (2023), equations 3.1-3.15 as corrected in the fusion notes; Blom and Bar-Shalom (1988).
     """
-    if keep not in ("all", "last"):
-        raise ModelError(f'keep is "all" or "last", not {keep!r}.')
-    if num_threads is not None and num_threads < 1:
-        raise ModelError(f"num_threads is at least 1, not {num_threads}.")
+    check_settings(keep, num_threads)
 
     def aligned(defer: bool) -> Aligned:
         return align(z, F=F, Q=Q, H=H, R=R, trans=trans, mean0=mean0, cov0=cov0, probs0=probs0, b=b, d=d, defer=defer)
 
-    if use_native(backend) and (backend == "native" or _fits_kernel(z, cov0, trans)):
-        from saltus.filters.native import filter_native
+    if use_native(backend) and (backend == "native" or fits_kernel(cov0, z, trans)):
+        from saltus.filters.native import Run, filter_native
 
-        measured = np.asarray(z, dtype=np.float64)
-        return filter_native(measured, aligned, per_mode=per_mode, every=keep == "all", num_threads=num_threads)
+        run = Run(per_mode=per_mode, every=keep == "all", num_threads=num_threads)
+        return filter_native(np.asarray(z, dtype=np.float64), aligned, run)
     return _filter(aligned(False), per_mode=per_mode, every=keep == "all")
-
-
-def _fits_kernel(z: npt.ArrayLike, cov0: npt.ArrayLike, trans: Sequence[npt.ArrayLike]) -> bool:
-    n, m, *sizes = (prod(np.shape(a)[-1:]) for a in (cov0, z, *trans))
-    return n <= MOST_STATES and m <= MOST_STATES and prod(sizes) <= MOST_MODES
 
 
 def _filter(model: Aligned, *, per_mode: bool, every: bool) -> Estimates:

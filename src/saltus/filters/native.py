@@ -1,6 +1,7 @@
 """The compiled twins: the batch recursion and the store of a Bank, on the arrays of their definitions."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import prod
 from typing import Any
 
@@ -14,7 +15,7 @@ from saltus.filters.estimates import Estimates
 from saltus.filters.particles import Merged, Tables
 from saltus.filters.steps import NOT_POSITIVE, Belief
 
-__all__ = ["NativeStore", "filter_native"]
+__all__ = ["NativeStore", "Run", "filter_native"]
 
 _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
@@ -24,45 +25,53 @@ _NOT_POSITIVE, _INFINITE, _DOUBTFUL = 1, 2, 4  # bits of the kernel's status
 _WRITTEN = ("probs", "mean", "cov", "log_likelihood", "nis", "n_observed", "mode_means", "mode_covs")
 
 
-def filter_native(
-    z: _Array, aligned: Callable[[bool], Aligned], *, per_mode: bool, every: bool, num_threads: int | None
-) -> Estimates:
+@dataclass(frozen=True, slots=True)
+class Run:
+    """How the compiled recursion goes over the rows, and what it writes."""
+
+    per_mode: bool = False  # also every mode's mean and covariance
+    every: bool = True  # all rows, not the last only
+    num_threads: int | None = None  # None chooses
+    reported: int | None = None  # only the first components of the state; None is all
+    from_first: bool = False  # the prior holds at the first row, and arrays over intervals begin with the second
+    map: _Array | None = None  # from the first row on the state is map @ state, its last m components the measured ones
+
+
+def filter_native(z: _Array, aligned: Callable[[bool], Aligned], run: Run) -> Estimates:
     """Run the compiled recursion.
 
     Args:
         z: the measurements with their NaN, (*batch, T, m).
         aligned: aligns the other arguments; True leaves the elements of large arrays to the kernel.
-        per_mode: also return every mode's mean and covariance.
-        every: keep all rows, not the last only.
-        num_threads: threads to use; None chooses.
+        run: its settings.
     """
-    model = aligned(True)
-    out, status = _run(z, model, per_mode, every, num_threads)
+    out, status = _run(z, aligned(True), run)
     if status & (_DOUBTFUL | _INFINITE):  # read every element: raises, or makes nearly symmetric covariances symmetric
-        model = aligned(False)
-        out, status = _run(z, model, per_mode, every, num_threads)
+        out, status = _run(z, aligned(False), run)
     if status & _NOT_POSITIVE:
         raise NumericalError(NOT_POSITIVE)
     return out
 
 
-def _run(z: _Array, model: Aligned, per_mode: bool, every: bool, num_threads: int | None) -> tuple[Estimates, int]:
+def _run(z: _Array, model: Aligned, run: Run) -> tuple[Estimates, int]:
     native = native_module()
     if native is None:
         raise ModelError("there is no compiled kernel here.")
     batch, (n_steps, m) = z.shape[:-2], z.shape[-2:]
     sizes, n, runs = model.sizes, model.cov0.shape[-1], prod(z.shape[:-2])
-    out = _allocate(batch, n_steps if every else 1, n_steps, sizes, n, per_mode)
+    reported = n if run.reported is None else run.reported
+    out = _allocate(batch, n_steps if run.every else 1, n_steps, sizes, reported, run.per_mode)
     if runs == 0:
         return out, 0
     work = float(runs) * n_steps * prod(sizes) * n * n * (n + m)
+    described = {"reported": reported, "from_first": run.from_first, "map": run.map}
     status = native.imm_filter(
         instruction_set(),
         np.ascontiguousarray(z.reshape((runs, n_steps, m))),
-        _described(model, batch),
+        _described(model, batch) | described,
         {name: getattr(out, name) for name in _WRITTEN},
-        every,
-        thread_count(num_threads, work),
+        run.every,
+        thread_count(run.num_threads, work),
     )
     return out, status
 
