@@ -116,8 +116,8 @@ def study(
 ) -> None:
     """Run the study NAME: metrics.json and pictures in OUTPUT.
 
-    NAME is coloured, faults, fusion, identification, jamming or radar. The study faults puts faults into the plots of
-    RECORDINGS, or of a simulated scene where none is named; the others simulate alone.
+    NAME is coloured, faults, fusion, identification, jamming, moments or radar. The study faults puts faults into the
+    plots of RECORDINGS, or of a simulated scene where none is named; the others simulate alone.
     """
     if name == "faults":
         if runs is not None:

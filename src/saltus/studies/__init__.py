@@ -11,6 +11,7 @@ from saltus.studies.coloured_report import coloured_study
 from saltus.studies.fusion_report import fusion_study
 from saltus.studies.identification_report import identification_study
 from saltus.studies.jamming_report import jamming_study
+from saltus.studies.moments_report import moments_study
 from saltus.studies.radar_report import radar_study
 
 __all__ = ["STUDIES", "Study", "run_study"]
@@ -31,6 +32,7 @@ STUDIES: dict[str, Study] = {
     "fusion": fusion_study,
     "identification": identification_study,
     "jamming": jamming_study,
+    "moments": moments_study,
     "radar": radar_study,
 }
 

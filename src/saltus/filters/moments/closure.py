@@ -17,6 +17,7 @@ _Array = npt.NDArray[np.float64]
 ClosureName = Literal["maxent", "hermite", "gaussian"]
 
 REACH = 5.5  # half width of the box, in standard deviations
+NEAR = 4.2  # the same about a posterior, whose nodes are spread by 1.3
 _HOPELESS = -1e3  # moment matrix so far from positive that even the raw closure begins anew
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
 
@@ -76,6 +77,8 @@ class Closing:
         self.basis = basis(n, order)
         self.protected = protected
         self.rule: Rule = gauss_legendre(n, count, REACH) if name == "maxent" else gauss_hermite(n, count)
+        # Where a posterior is looked at its spread is known: fewer deviations need be covered.
+        self.near: Rule = gauss_legendre(n, count, NEAR) if name == "maxent" else self.rule
         self._tables = tables(n, order, count, REACH) if name == "maxent" else None
         self._last: _Array | None = None
         self._n_runs = n_runs
@@ -95,9 +98,12 @@ class Closing:
         weights = self.closed(law)[1]
         return Points(law.log_probs, self.places(law.mean, law.root), weights)
 
-    def places(self, mean: Float[np.ndarray, "b s n"], root: Float[np.ndarray, "b s n n"]) -> _Array:
-        """Nodes of the rule about means: mean + root xi, (b, s, q, n)."""
-        return np.asarray(mean[:, :, None] + self.rule.nodes @ root.swapaxes(-1, -2))
+    def places(
+        self, mean: Float[np.ndarray, "b s n"], root: Float[np.ndarray, "b s n n"], rule: Rule | None = None
+    ) -> _Array:
+        """Nodes of a rule, by default the closure's, about means: mean + root xi, (b, s, q, n)."""
+        nodes = (self.rule if rule is None else rule).nodes
+        return np.asarray(mean[:, :, None] + nodes @ root.swapaxes(-1, -2))
 
     def _none(self) -> Tally:
         return Tally(*(np.zeros(self._n_runs, dtype=np.int64) for _ in Tally._fields))

@@ -23,7 +23,7 @@ from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE
 
 __all__ = ["MomentFilter"]
 
-_NODES = {"maxent": {1: 48, 2: 28, 3: 14}, "hermite": {1: 36, 2: 20, 3: 10}, "gaussian": {1: 36, 2: 20, 3: 10}}
+_NODES = {"maxent": {1: 48, 2: 24, 3: 14}, "hermite": {1: 36, 2: 20, 3: 10}, "gaussian": {1: 36, 2: 20, 3: 10}}
 _MOST_NODES = 20_000
 Closure = Literal["maxent", "hermite", "gaussian", "auto"]
 Representation = Literal["grid", "sum", "maxent", "gaussian", "hermite"]

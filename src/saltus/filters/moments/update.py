@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
 
+from saltus.filters.moments.basis import Rule
 from saltus.filters.moments.belief import Points, root_of
 from saltus.filters.moments.closure import Closing, Density
 from saltus.filters.observation import innovation_nis
@@ -66,9 +67,9 @@ def update(
         points, log_l, failed = _raw(law.log_probs, y, first, top)
         return Updated(points, log_l, nis, failed)
     weights, root, mean = np.maximum(first, 0.0), law.root, law.mean
-    for _ in range(_PASSES):
-        mean, root, narrow = _placed(closing, y, weights, root)
-        y = closing.places(mean, root)
+    for k in range(_PASSES):
+        mean, root, narrow = _placed(closing.rule if k == 0 else closing.near, y, weights, root)
+        y = closing.places(mean, root, closing.near)
         log_w = _log_weights(closing, density, root, y, _log_likelihoods(sensor, z, y, dt))
         top = log_w.max(axis=-1, keepdims=True)
         weights = np.exp(log_w - top)
@@ -79,7 +80,7 @@ def update(
     return Updated(points, log_l, nis, np.zeros(len(z), dtype=bool))
 
 
-def _placed(closing: Closing, y: _Array, w: _Array, root: _Array) -> tuple[_Array, _Array, bool]:
+def _placed(rule: Rule, y: _Array, w: _Array, root: _Array) -> tuple[_Array, _Array, bool]:
     """Where to put the nodes next, and whether those at hand were too coarse for what they found.
 
     Nodes at distance d see a Gaussian of deviation s with an error of exp(-2 (pi s / d)^2), 1e-5 where s = 0.75 d.
@@ -88,7 +89,7 @@ def _placed(closing: Closing, y: _Array, w: _Array, root: _Array) -> tuple[_Arra
     mean = (share * y).sum(axis=2)
     off = (y - mean[:, :, None]) @ np.linalg.inv(root).swapaxes(-1, -2)
     cov = symmetric((share * off).swapaxes(-1, -2) @ off)
-    line = np.unique(closing.rule.nodes[:, 0])
+    line = np.unique(rule.nodes[:, 0])
     d = line[len(line) // 2] - line[len(line) // 2 - 1]
     narrow = np.linalg.eigvalsh(cov)[..., 0] < (0.75 * d) ** 2
     wide = _WIDEN * root @ root_of(cov + 0.25 * d**2 * narrow[..., None, None] * np.eye(cov.shape[-1]))
@@ -101,7 +102,7 @@ def _log_weights(closing: Closing, density: Density, root: _Array, y: _Array, lo
     xi = (y - law.mean[:, :, None]) @ np.linalg.inv(law.root).swapaxes(-1, -2)
     value, sign = density.log_value(xi)
     stretch = np.log(np.diagonal(root, axis1=-2, axis2=-1) / np.diagonal(law.root, axis1=-2, axis2=-1)).sum(-1)
-    return np.where(sign > 0, value + closing.rule.log_weights + stretch[..., None] + log_g, -np.inf)
+    return np.where(sign > 0, value + closing.near.log_weights + stretch[..., None] + log_g, -np.inf)
 
 
 def _log_likelihoods(sensor: DiffusionSensor, z: _Array, y: _Array, dt: float) -> _Array:
