@@ -233,6 +233,8 @@ def test_the_report_is_written_unless_declined(two, tmp_path):
     assert {p.name for p in (folder / "out").iterdir()} == {
         "tracks.parquet",
         "assignments.parquet",
+        "identifications.parquet",
+        "biases.json",
         "summary.json",
         "report.html",
     }
@@ -446,7 +448,9 @@ def leftovers(folder):
     return [p.name for p in folder.rglob("*") if p.name.startswith(".") or "tmp" in p.name]
 
 
-@pytest.mark.parametrize("where", ["saltus.run.place_plots", "saltus.run.assignment_table", "saltus.run.json.dumps"])
+@pytest.mark.parametrize(
+    "where", ["saltus.tracking.place_plots", "saltus.run.assignment_table", "saltus.run.json.dumps"]
+)
 @pytest.mark.parametrize("older", [False, True])
 def test_ctrl_c_leaves_nothing_half_written(tmp_path, monkeypatch, where, older):
     folder = tmp_path / "here"

@@ -16,12 +16,15 @@ sigma_xy = 10.0                   # m (plane and geodetic positions),
 sigma_altitude = 8.0              # m
 period = 4.0                      # optional: s between two reports of one target
 correlation_time = 5.0            # optional: s that errors last
+system = "platform"               # optional: sources of one system make common local tracks
 
 [editions]
 21 = "0.23"                       # category = edition; others are guessed
 
 [tracker]                         # fields of saltus.tracks.settings.TrackerSettings
 [filter]                          # fields of saltus.tracks.settings.FilterSettings
+[systems]                         # fields of saltus.tracks.settings.SystemsSettings
+[registration]                    # fields of saltus.tracks.registration.RegistrationSettings
 """
 
 import dataclasses
@@ -36,7 +39,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 
 from saltus.errors import ModelError
 from saltus.records import System
-from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.registration import RegistrationSettings
+from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
 
 __all__ = ["Config", "SensorConfig", "load_config", "parse_date"]
 
@@ -53,12 +57,13 @@ _HINTS = {
     "sigma_altitude": "one standard deviation in m, above 0 and up to 10000",
     "correlation_time": "s, above 0 and up to 3600",
     "name": 'text, as name = "BCN"',
+    "system": 'text, as system = "platform"',
     "period": "the time between two reports of one target in s, above 0 and up to 3600",
     "date": "a date, as date = 2023-05-02",
     "editions": 'category = "edition" in quotes, as 21 = "0.23"',
 }
 
-T = TypeVar("T", TrackerSettings, FilterSettings)
+T = TypeVar("T", TrackerSettings, FilterSettings, SystemsSettings, RegistrationSettings)
 _Octet = Annotated[int, Field(ge=0, le=255)]
 _Sigma = Annotated[float, Field(gt=0.0, le=1e4)]
 
@@ -81,6 +86,7 @@ class SensorConfig(BaseModel):
     sigma_altitude: _Sigma | None = None
     period: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
     correlation_time: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
+    system: str = ""
 
     @model_validator(mode="after")
     def _identified(self) -> "SensorConfig":
@@ -109,6 +115,8 @@ class Config(BaseModel):
     editions: dict[int, str] = Field(default_factory=dict)
     tracker: TrackerSettings = Field(default_factory=TrackerSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
+    systems: SystemsSettings = Field(default_factory=SystemsSettings)
+    registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
 
     def site_for(self, system: System) -> SensorConfig | None:
         """The sensor of a system; one that names the category goes before one that does not."""
@@ -133,6 +141,8 @@ def load_config(path: Path | str | None) -> Config:
     values: dict[str, object] = {
         "tracker": _settings(path, "tracker", content.get("tracker", {}), TrackerSettings),
         "filter": _settings(path, "filter", content.get("filter", {}), FilterSettings),
+        "systems": _settings(path, "systems", content.get("systems", {}), SystemsSettings),
+        "registration": _settings(path, "registration", content.get("registration", {}), RegistrationSettings),
         "sensor": _sensors(path, content.get("sensor", [])),
         "editions": _editions(path, content.get("editions", {})),
     }

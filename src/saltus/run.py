@@ -9,7 +9,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -18,22 +17,18 @@ from saltus import io
 from saltus.config import Config, SensorConfig, load_config, parse_date
 from saltus.errors import DataError
 from saltus.geo import Site
+from saltus.identified import bias_tables, conflict_lines, identification_summary, identification_table
 from saltus.io.write import output_directory
+from saltus.pipeline import Identified, track_plots
 from saltus.progress import Progress, progress_bar
 from saltus.records import REASONS, Kind, Plots, Recording, Source
-from saltus.summary import SIGMAS, Sensors, Tracked, health_of, noise_rows, reported_kind, show_summary, summarise
-from saltus.tracks.measurements import Measurements, default_noise, make_plane, place_plots
-from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
+from saltus.summary import Sensors, Tracked, health_of, noise_rows, show_summary, summarise
 from saltus.tracks.output import assignment_table, innovation_table, track_table
-from saltus.tracks.settings import TrackerSettings
-from saltus.tracks.tracker import Assignments, Rows, Tracker, join_rows
+from saltus.tracks.tracker import Rows, join_rows
 
 __all__ = ["track_files", "track_recording"]
 
-_Array = npt.NDArray[np.float64]
-
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
-_NOISE_PLOTS = 5_000  # reports of each source that the noise is estimated from before tracking
 _DAY = 86400.0  # s
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
 
@@ -75,18 +70,19 @@ def track_files(
         recording = io.read(inputs, date=day, editions=config.editions, progress=bar.reading)
         decoded = time.perf_counter()
         plots, sensors, problems = _prepare(recording, config, time_from, time_to)
-        tracked = _track(plots, sensors, config, identity == "use", bar)
+        tracked, whole = track_plots(plots, recording.tracks, sensors, config, bar, use_identity=identity == "use")
         tracks, gates = _tables(tracked, plots, config)
         assigned = assignment_table(plots, tracked.measurements, tracked.assignments)
         done = time.perf_counter()
+        problems += conflict_lines(whole)
         summary = summarise(inputs, plots, sensors, tracked, tracks, assigned, problems)
+        summary["systems"] = identification_summary(whole)
         summary["settings"] = {
             "identity": identity,
-            "tracker": asdict(config.tracker),
-            "filter": asdict(config.filter),
+            **{name: asdict(getattr(config, name)) for name in ("tracker", "filter", "systems", "registration")},
         }
         summary["seconds"] = {"decoding": round(decoded - began, 2), "tracking": round(done - decoded, 2)}
-        _write(folder, tracks, assigned, summary)
+        _write(folder, tracks, assigned, whole, summary)
         if report:
             from saltus.report import write_report
 
@@ -120,7 +116,7 @@ def track_recording(
         `assignments.parquet`, one row for each report in the same order.
     """
     plots, sensors, _ = _prepare(recording, config, None, None)
-    tracked = _track(plots, sensors, config, True, bar or Progress())
+    tracked, _ = track_plots(plots, recording.tracks, sensors, config, bar or Progress(), use_identity=True)
     tracks, _ = _tables(tracked, plots, config)
     return plots, tracks, assignment_table(plots, tracked.measurements, tracked.assignments)
 
@@ -211,7 +207,7 @@ def _nothing_left(plots: Plots, problems: Sequence[str]) -> str:
 def _sensors(sources: Sequence[Source], recording: Recording, config: Config) -> Sensors:
     sites: list[Site | None] = []
     configured: list[dict[str, float]] = []
-    periods, told_periods, names = [], [], []
+    periods, told_periods, names, told_systems = [], [], [], []
     for source in sources:
         sensor = config.site_for(source.system)
         sites.append(None if sensor is None else _site(sensor))
@@ -222,7 +218,8 @@ def _sensors(sources: Sequence[Source], recording: Recording, config: Config) ->
         periods.append(_NO_PERIOD if np.isnan(told_periods[-1]) else told_periods[-1])
         configured.append({} if sensor is None else _noise(sensor, periods[-1]))
         names.append(sensor.name if sensor is not None and sensor.name else str(source.system))
-    return Sensors(sites, configured, periods, told_periods, names)
+        told_systems.append("" if sensor is None else sensor.system)
+    return Sensors(sites, configured, periods, told_periods, names, told_systems)
 
 
 def _site(sensor: SensorConfig) -> Site | None:
@@ -250,57 +247,6 @@ def _noise(sensor: SensorConfig, period: float) -> dict[str, float]:
     return {field: value for field, value in given.items() if value is not None}
 
 
-def _track(plots: Plots, sensors: Sensors, config: Config, use_identity: bool, bar: Progress) -> Tracked:
-    """Estimate the noise nobody configured on a first stretch, then track everything."""
-    plane = make_plane(plots, sensors.sites)
-    sources = range(len(plots.sources))
-    noise = {s: replace(default_noise(plots.sources[s]), **sensors.configured[s]) for s in sources}
-
-    def run(
-        part: Plots, label: str, settings: TrackerSettings
-    ) -> tuple[list[Rows], Measurements, Assignments, dict[int, NoiseEstimate]]:
-        m = place_plots(part, plane, sensors.sites, noise, settings.height_prior)
-        tracker = Tracker(settings, config.filter, sensors.periods, use_identity=use_identity)
-        rows: list[Rows] = []
-        found = tracker.run(m, rows.append, lambda share: bar.working(label, share))
-        kept = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)
-        return rows, m, found, {s: estimate_noise(m, kept, s) for s in sources}
-
-    if any(not _configured(plots, s, sensors.configured[s]) for s in sources):
-        stretch = _first_stretch(plots)
-        well = replace(config.tracker, degraded_noise=1.0)  # larger errors are the noise sought, no condition
-        *_, estimates = run(stretch, "estimating noise", well)
-        for s in sources:
-            estimated = apply_estimate(noise[s], estimates[s], plots.sources[s])
-            noise[s] = replace(estimated, **sensors.configured[s])
-        rows, m, *_ = run(stretch, "checking noise", well)
-        for s in sources:
-            noise[s] = replace(widened(noise[s], _steady_d2(rows, m, s)), **sensors.configured[s])
-    rows, m, found, estimates = run(plots, "tracking", config.tracker)
-    return Tracked(rows, m, found, plane, noise, estimates)
-
-
-def _steady_d2(rows: Sequence[Rows], m: Measurements, s: int) -> _Array:
-    """Return the innovations of one source's updates in steady motion, as squared Mahalanobis distances."""
-    all_rows = join_rows(rows)
-    at = (all_rows.measurement >= 0) & (m.source[all_rows.measurement] == s)
-    return np.asarray(all_rows.d2[at & (all_rows.moments.p_manoeuvre_h < 0.5) & np.isfinite(all_rows.d2)])
-
-
-def _configured(plots: Plots, s: int, given: dict[str, float]) -> bool:
-    """Say whether the configuration gives every standard deviation that the source's reports need."""
-    return {field for _, field, _ in SIGMAS[reported_kind(plots, s)]} <= set(given)
-
-
-def _first_stretch(plots: Plots) -> Plots:
-    """Return the reports up to the time by which every source gave enough to estimate its noise from."""
-    last = 0
-    for s in range(len(plots.sources)):
-        own = np.flatnonzero((plots.source == s) & (plots.reason == 0))
-        last = max(last, int(own[min(len(own), _NOISE_PLOTS) - 1]) if len(own) else 0)
-    return plots.take(slice(0, last + 1))
-
-
 def _tables(tracked: Tracked, plots: Plots, config: Config) -> tuple[pa.Table, pa.Table]:
     """Return the rows of tracks that were confirmed at some time, in time order, and their gates."""
     m, plane = tracked.measurements, tracked.plane
@@ -321,7 +267,10 @@ def _chunks(rows: Sequence[Rows], size: int = 200) -> Iterator[Rows]:
         yield join_rows(rows[k : k + size])
 
 
-def _write(folder: Path, tracks: pa.Table, assigned: pa.Table, summary: dict[str, object]) -> None:
+def _write(folder: Path, tracks: pa.Table, assigned: pa.Table, whole: Identified, summary: dict[str, object]) -> None:
     pq.write_table(tracks, folder / "tracks.parquet")
     pq.write_table(assigned, folder / "assignments.parquet")
+    pq.write_table(identification_table(whole), folder / "identifications.parquet")
+    biases = json.dumps(bias_tables(whole), indent=2) + "\n"
+    (folder / "biases.json").write_text(biases, encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")

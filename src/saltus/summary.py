@@ -38,6 +38,7 @@ class Sensors:
     periods: list[float]  # update period used, s
     told_periods: list[float]  # as configured or found in the recording, NaN where neither tells
     names: list[str]
+    told_systems: list[str]  # system of each source as configured, "" where it is not
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,13 +70,13 @@ def effects(ray: Float[np.ndarray, "n 2"], velocity: Float[np.ndarray, "n 2"]) -
     return out
 
 
-def second_order(mean: Float[np.ndarray, " q"]) -> Float[np.ndarray, " q"]:
+def second_order(mean: Float[np.ndarray, "*n q"]) -> Float[np.ndarray, "*n q"]:
     """Return biases whose linear effect on reported rays is right to the second order of an azimuth bias.
 
     Turning a reported ray p back by d takes away d c + d^2/2 p, c the effect of azimuth: like a scale error of d^2/2.
     """
     out = np.array(mean)
-    out[4] += 0.5 * mean[2] ** 2
+    out[..., 4] += 0.5 * mean[..., 2] ** 2
     return out
 
 

@@ -47,44 +47,76 @@ def accept_pairs(
 
     Pairs named alike are taken. Where there are none, every other pair proposes the bias of the one group with the
     greatest expected effect that would explain it, and the proposal on which most pairs agree wins: false pairs
-    disagree with each other. Once biases are known from many objects, pairs are gated about them instead. A track is
-    in one pair at a time.
+    disagree with each other. Biases known from before are one more proposal, with their uncertainty. A track is in one
+    pair at a time.
 
     Args:
         blocks: residuals, pairs numbered from 0 without gaps.
         tracks: the two tracks of each pair, (P, 2).
         told: pairs that both systems name alike, (P,).
-        known: mean and covariance of the biases, if they were estimated from many objects before.
+        known: mean and covariance of the biases, if they were estimated before.
         prior: standard deviations of the biases before anything is known.
         scatter: between objects, m.
     """
     if told.any():
         return told if told.sum() >= _FEWEST else np.zeros(len(tracks), bool)
-    pairs = _summed(blocks, len(tracks))
+    group = _greatest(blocks, prior)
+    own = _own_proposals(blocks, len(tracks), group, len(prior))
+    found = [_about(_summed(blocks, own), tracks, None, own, prior, scatter)]
+    if known is not None:
+        everywhere = np.broadcast_to(known[0], own.shape)
+        found.insert(0, _about(_summed(blocks, everywhere), tracks, known, own, prior, scatter))
+    best = max(found, key=lambda chosen: int(chosen.sum()))  # the first of equals: what was known
+    return best if best.sum() >= _FEWEST else np.zeros(len(tracks), bool)
+
+
+def _about(
+    pairs: _Pairs, tracks: _Index, known: tuple[_Array, _Array] | None, own: _Array, prior: _Array, scatter: float
+) -> _Mask:
+    """Choose the pairs that agree with known biases, or with the ones that most agree on."""
     steady = (pairs.size >= _LEAST_BLOCKS) & (pairs.spread <= _STEADY * np.sqrt(_variance(pairs.cov) + scatter**2))
     if known is None:
-        start, wide = _agreed(pairs, tracks, np.flatnonzero(steady), prior, scatter), np.zeros((len(prior), len(prior)))
-    else:
-        start, wide = known
-    if start is None:
-        return np.zeros(len(tracks), bool)
-    d2 = _distance(pairs, np.arange(len(tracks)), start, wide, scatter)
-    chosen = _one_to_one(pairs, tracks, np.flatnonzero(steady & (d2 < _GATE)), d2)
-    return chosen if chosen.sum() >= _FEWEST else np.zeros(len(tracks), bool)
+        agreed = _agreed(pairs, tracks, np.flatnonzero(steady), own, scatter)
+        if agreed is None:
+            return np.zeros(len(tracks), bool)
+        known = agreed, np.zeros((len(prior), len(prior)))
+    d2 = _distance(pairs, np.arange(len(tracks)), *known, scatter)
+    return _one_to_one(pairs, tracks, np.flatnonzero(steady & (d2 < _GATE)), d2)
 
 
-def _summed(blocks: Blocks, n: int) -> _Pairs:
+def _greatest(blocks: Blocks, prior: _Array) -> list[int]:
+    """Return the parameters of the group with the greatest expected effect."""
+    size = {name: float(np.linalg.norm(blocks.effect[..., list(g)] * prior[list(g)])) for name, g in GROUPS.items()}
+    return list(GROUPS[max(size, key=lambda name: size[name])])
+
+
+def _own_proposals(blocks: Blocks, n: int, group: list[int], q: int) -> _Array:
+    """Biases of one group that would explain each pair alone, by least squares over its blocks, (P, q)."""
+    first = np.searchsorted(blocks.pair, np.arange(n))
+    B = blocks.effect[..., group]
+    BB = np.add.reduceat(np.einsum("nij,nik->njk", B, B), first, axis=0)
+    Br = np.add.reduceat(np.einsum("nij,ni->nj", B, blocks.residual), first, axis=0)
+    out = np.zeros((n, q))
+    out[:, group] = np.einsum("pij,pj->pi", np.linalg.pinv(BB, hermitian=True), Br)
+    return out
+
+
+def _summed(blocks: Blocks, about: _Array) -> _Pairs:
+    """One residual for each pair, its scatter judged when the biases `about` (P, q) are taken out."""
+    n = len(about)
     first = np.searchsorted(blocks.pair, np.arange(n))
     stop = np.searchsorted(blocks.pair, np.arange(n), side="right")
-    count = stop - first
-    middle = np.stack([medians(blocks.residual[:, c], blocks.pair, first, count) for c in (0, 1)], axis=-1)
-    away = np.linalg.norm(blocks.residual - middle[blocks.pair], axis=-1)
+    size = stop - first
+    left = blocks.residual - np.einsum("nij,nj->ni", blocks.effect, about[blocks.pair])
+    middle = np.stack([medians(left[:, c], blocks.pair, first, size) for c in (0, 1)], axis=-1)
+    away = np.linalg.norm(left - middle[blocks.pair], axis=-1)
+    effect = np.add.reduceat(blocks.effect, first, axis=0) / size[:, None, None]
     return _Pairs(
-        middle,
-        np.add.reduceat(blocks.effect, first, axis=0) / count[:, None, None],
-        np.add.reduceat(blocks.cov, first, axis=0) / count[:, None, None],
-        medians(away, blocks.pair, first, count) / 1.1774,  # the median of a Rayleigh law
-        count,
+        middle + np.einsum("pij,pj->pi", effect, about),
+        effect,
+        np.add.reduceat(blocks.cov, first, axis=0) / size[:, None, None],
+        medians(away, blocks.pair, first, size) / 1.1774,  # the median of a Rayleigh law
+        size,
         blocks.time[first],
         blocks.time[stop - 1],
     )
@@ -102,13 +134,13 @@ def _distance(pairs: _Pairs, at: _Index, mean: _Array, cov: _Array, scatter: flo
     return np.asarray(np.einsum("...pi,pij,...pj->...p", left, np.linalg.inv(S), left))
 
 
-def _agreed(pairs: _Pairs, tracks: _Index, at: _Index, prior: _Array, scatter: float) -> _Array | None:
+def _agreed(pairs: _Pairs, tracks: _Index, at: _Index, own: _Array, scatter: float) -> _Array | None:
     """Return the bias of one group on which most pairs agree, or None where none is clear."""
     if len(at) < _FEWEST:
         return None
-    proposals = _proposals(pairs, at[np.argsort(-pairs.size[at], kind="stable")[:_PROPOSALS]], prior)
+    proposals = own[at[np.argsort(-pairs.size[at], kind="stable")[:_PROPOSALS]]]
     at = at[np.argsort(tracks[at, 0], kind="stable")]
-    agree = _distance(pairs, at, proposals, np.zeros((len(prior), len(prior))), scatter) < _GATE
+    agree = _distance(pairs, at, proposals, np.zeros((own.shape[1], own.shape[1])), scatter) < _GATE
     vote = np.where(agree, np.minimum(pairs.size[at], _FULL_VOTE), 0)
     first = np.flatnonzero(np.diff(tracks[at, 0], prepend=-1))
     votes = np.maximum.reduceat(vote, first, axis=1).sum(axis=1)  # a track has one vote
@@ -118,16 +150,6 @@ def _agreed(pairs: _Pairs, tracks: _Index, at: _Index, prior: _Array, scatter: f
     if rival.any() and votes[rival].max() > _CLEAR * votes[best]:
         return None
     return np.asarray(proposals[best])
-
-
-def _proposals(pairs: _Pairs, at: _Index, prior: _Array) -> _Array:
-    """Biases of the group with the greatest expected effect that would explain each pair alone, (k, q)."""
-    effect = pairs.effect[at]
-    size = {name: np.linalg.norm(effect[..., list(g)] * prior[list(g)]) for name, g in GROUPS.items()}
-    group = list(GROUPS[max(size, key=lambda name: float(size[name]))])
-    out = np.zeros((len(at), len(prior)))
-    out[:, group] = np.einsum("pij,pj->pi", np.linalg.pinv(effect[..., group]), pairs.residual[at])
-    return out
 
 
 def _one_to_one(pairs: _Pairs, tracks: _Index, at: _Index, d2: _Array) -> _Mask:

@@ -18,8 +18,6 @@ __all__ = ["Registration", "RegistrationSettings", "register"]
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 
-_ENOUGH = 20  # objects: from then on pairs are gated about the last estimate
-
 
 @dataclass(frozen=True, slots=True)
 class RegistrationSettings:
@@ -71,7 +69,7 @@ class Registration(NamedTuple):
 
     series: BiasSeries
     not_estimated: dict[str, str]  # group of parameters -> why, at the last time
-    residual_sd: float  # m: of a block's residual about its object's own offset, each axis
+    excess_sd: float  # m: of what differs within an object beyond the stated noise, each axis
 
 
 def register(
@@ -98,7 +96,7 @@ def register(
             fits.append(fit)
             times.append(now)
     stated = np.trace(blocks.cov, axis1=-2, axis2=-1) / 2.0
-    sd = float(np.sqrt(fit.noise * np.median(stated))) if len(stated) else float("nan")
+    sd = float(np.sqrt(max(fit.noise - 1.0, 0.0) * np.median(stated))) if len(stated) else 0.0
     return Registration(_series(times, fits, settings), fit.refused, sd)
 
 
@@ -144,7 +142,7 @@ def _estimate(
     if not len(blocks.time):
         return nothing
     names, blocks = _renumbered(blocks)
-    known = (before.mean, before.cov) if before.objects >= _ENOUGH and len(before.chosen) else None
+    known = (before.mean, before.cov) if len(before.chosen) else None
     accepted = accept_pairs(blocks, tracks[names], told[names], known, settings.prior, before.scatter)
     if not accepted.any():
         return nothing

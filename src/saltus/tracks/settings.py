@@ -7,7 +7,7 @@ import numpy as np
 
 from saltus.errors import ModelError
 
-__all__ = ["FilterSettings", "TrackerSettings"]
+__all__ = ["FilterSettings", "SystemsSettings", "TrackerSettings"]
 
 _FASTEST_TURN = 45.0  # degrees/s: faster, a turn is a circle between two plots
 
@@ -154,3 +154,52 @@ class TrackerSettings:
         for name, value in given.items():
             if not 0.0 < value < np.inf:
                 raise ModelError(f"tracker.{name} must be positive and finite, got {value}.")
+
+
+@dataclass(frozen=True, slots=True)
+class SystemsSettings:
+    """When tracks of two systems become one.
+
+    Attributes:
+        reference: name of the system whose positions hold; "" = that with the smallest stated noise.
+        p_false: largest probability of being two objects with which two tracks are declared one.
+        p_false_split: the same for two tracks of one system.
+        hysteresis: log-odds by which a declared pair may fall short of the best alternative, nats.
+        window: s; what tracks did longer ago says nothing about whether they are one object now.
+        settle: s after its confirmation within which the decision on a new local track counts from its beginning.
+        offset_time: s that the difference between two systems' positions of one object lasts.
+        spacing: s that short errors last: of reports of one track that follow faster, one in so many s counts.
+        speed: standard deviation of each component of an object's velocity, m/s.
+        track_sigma: standard deviation of positions in another centre's tracks (CAT062), each axis, m.
+        track_memory: time constant of that centre's filter, s.
+    """
+
+    reference: str = ""
+    p_false: float = 1e-3
+    p_false_split: float = 1e-6
+    hysteresis: float = 5.0
+    window: float = 120.0
+    settle: float = 12.0
+    offset_time: float = 60.0
+    spacing: float = 10.0
+    speed: float = 100.0
+    track_sigma: float = 50.0
+    track_memory: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot be."""
+        for name in ("p_false", "p_false_split"):
+            if not 0.0 < getattr(self, name) < 0.5:
+                raise ModelError(f"systems.{name} is a probability below 0.5, got {getattr(self, name)}.")
+        for name in (
+            "hysteresis",
+            "window",
+            "settle",
+            "offset_time",
+            "spacing",
+            "speed",
+            "track_sigma",
+            "track_memory",
+        ):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ModelError(f"systems.{name} must be positive and finite, got {getattr(self, name)}.")

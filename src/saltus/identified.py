@@ -1,0 +1,135 @@
+"""What a run found of identity and biases, as tables and lines: identifications.parquet, biases.json."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from saltus.pipeline import Identified
+from saltus.tracks.bias import PARAMETERS
+from saltus.tracks.systems import Registered
+
+__all__ = ["bias_tables", "conflict_lines", "identification_summary", "identification_table"]
+
+_LASTING = 20.0  # s: a conflict shorter than this is no line for the user
+_MOST_LINES = 8
+_KINDS = {
+    "rival": "both claim one track",
+    "addresses": "are one object by their positions and two by their addresses",
+    "places": "have one address at two places",
+    "inconsistent": "are one object by themselves, but not with the others of their group",
+}
+
+
+def identification_table(whole: Identified) -> pa.Table:
+    """Return one row for each stretch of time in which a system's local track was part of a system track.
+
+    The first local track of a system track has probability 1; another one that with which it was declared the same
+    object.
+    """
+    s = whole.segments
+    names = np.repeat([x.name for x in whole.systems], [len(x.ids) for x in whole.systems])
+    labels = [label for x in whole.systems for label in x.local_id]
+    shown = _with_own(whole)
+    order = np.lexsort((s.time_from, s.system_track))
+    order = order[np.isin(s.system_track[order], shown)]
+    return pa.table(
+        {
+            "track_id": pa.array(s.system_track[order], pa.int64()),
+            "system": pa.array([str(names[k]) for k in s.track[order]], pa.string()),
+            "local_id": pa.array([labels[k] or None for k in s.track[order]], pa.string()),
+            "time_from": pa.array(s.time_from[order], pa.float64()),
+            "time_to": pa.array(s.time_to[order], pa.float64()),
+            "probability": pa.array(s.probability[order], pa.float64()),
+        }
+    )
+
+
+def _with_own(whole: Identified) -> npt.NDArray[np.int64]:
+    """System tracks that hold measurements, and not another centre's tracks alone."""
+    own = np.repeat([x.own for x in whole.systems], [len(x.ids) for x in whole.systems])
+    return np.unique(whole.segments.system_track[own[whole.segments.track]]) if len(own) else np.zeros(0, np.int64)
+
+
+def bias_tables(whole: Identified) -> dict[str, Any]:
+    """Return every system's biases against the one it was compared with: reported minus true, as of the end.
+
+    `series` holds the estimates over time, each from what was known then.
+    """
+    reference = next(r.name for r in whole.registered if r.found is None)
+    return {
+        "convention": "value = reported minus true; true is what the system named in relative_to says",
+        "reference": reference,
+        "systems": {r.name: _biases(r) for r in whole.registered if r.found is not None},
+    }
+
+
+def _biases(r: Registered) -> dict[str, Any]:
+    found = r.found
+    if found is None:
+        return {}
+    series = found.series
+    table: dict[str, Any] = {"relative_to": r.to, "common_objects": 0, "biases": {}}
+    table["not_estimated"] = found.not_estimated
+    if not len(series.time):
+        return table | {"series": []}
+    table["common_objects"] = int(series.objects[-1])
+    table["scatter_between_objects_m"] = _rounded(series.scatter[-1])
+    table["excess_within_objects_m"] = _rounded(found.excess_sd)
+    table["biases"] = _values(series.mean[-1], series.cov[-1], series.estimated[-1])
+    table["series"] = [
+        {"time": float(t), "common_objects": int(n), **_values(mean, cov, known)}
+        for t, n, mean, cov, known in zip(
+            series.time, series.objects, series.mean, series.cov, series.estimated, strict=True
+        )
+    ]
+    return table
+
+
+def _values(
+    mean: npt.NDArray[np.float64], cov: npt.NDArray[np.float64], known: npt.NDArray[np.bool_]
+) -> dict[str, Any]:
+    out = {}
+    for k in np.flatnonzero(known):
+        name, scale = PARAMETERS[k], 1.0
+        if name == "azimuth_rad":
+            name, scale = "azimuth_deg", float(180.0 / np.pi)
+        out[name] = {"value": _rounded(mean[k] * scale), "sd": _rounded(float(np.sqrt(cov[k, k])) * scale)}
+    return out
+
+
+def _rounded(value: float) -> float | None:
+    return float(f"{value:.4g}") if np.isfinite(value) else None
+
+
+def identification_summary(whole: Identified) -> dict[str, Any]:
+    """Count what each system had and how much of it was found in other systems too."""
+    s = whole.segments
+    owner = np.repeat(np.arange(len(whole.systems)), [len(x.ids) for x in whole.systems])
+    out: dict[str, Any] = {}
+    for k, system in enumerate(whole.systems):
+        mine = owner[s.track] == k
+        others = np.unique(s.system_track[~mine])
+        shared = np.unique(s.track[mine & np.isin(s.system_track, others)])
+        out[system.name] = {"local_tracks": len(system.ids), "identified_with_another_system": len(shared)}
+    return out
+
+
+def conflict_lines(whole: Identified) -> list[str]:
+    """Say which identities contradict each other, the longest first; none is resolved silently."""
+    names = np.repeat([x.name for x in whole.systems], [len(x.ids) for x in whole.systems])
+    labels = [label for x in whole.systems for label in x.local_id]
+
+    def named(k: int) -> str:
+        return f"{names[k]} {labels[k] or f'track {k + 1}'}"
+
+    found = [c for c in whole.decisions.conflicts if c.time_to - c.time_from >= _LASTING]
+    found.sort(key=lambda c: c.time_from - c.time_to)
+    lines = [
+        f"identity conflict: {named(c.a)} and {named(c.b)} {_KINDS[c.kind]}, for {c.time_to - c.time_from:.0f} s."
+        for c in found[:_MOST_LINES]
+    ]
+    if len(found) > _MOST_LINES:
+        lines.append(f"{len(found) - _MOST_LINES} more identity conflicts: see the report.")
+    return lines

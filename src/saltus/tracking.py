@@ -1,0 +1,85 @@
+"""One system through the tracker: the noise nobody configured is estimated first."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.config import Config
+from saltus.geo import Plane
+from saltus.progress import Progress
+from saltus.records import Plots
+from saltus.summary import SIGMAS, Sensors, Tracked, reported_kind
+from saltus.tracks.measurements import Measurements, default_noise, place_plots
+from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
+from saltus.tracks.settings import TrackerSettings
+from saltus.tracks.tracker import Assignments, Rows, Tracker, join_rows
+
+__all__ = ["track_system"]
+
+_Array = npt.NDArray[np.float64]
+
+_NOISE_PLOTS = 5_000  # reports of each source that the noise is estimated from before tracking
+
+
+def track_system(
+    plots: Plots, plane: Plane, sensors: Sensors, config: Config, bar: Progress, *, use_identity: bool
+) -> Tracked:
+    """Estimate the noise nobody configured on a first stretch, then track everything usable.
+
+    Args:
+        plots: reports in time order; those of other systems carry a reason.
+        plane: the plane of all systems.
+        sensors: what is known of the sources.
+        config: settings.
+        bar: shows progress.
+        use_identity: whether addresses and codes count.
+    """
+    sources = range(len(plots.sources))
+    noise = {s: replace(default_noise(plots.sources[s]), **sensors.configured[s]) for s in sources}
+
+    def run(
+        part: Plots, label: str, settings: TrackerSettings
+    ) -> tuple[list[Rows], Measurements, Assignments, dict[int, NoiseEstimate]]:
+        m = place_plots(part, plane, sensors.sites, noise, settings.height_prior)
+        tracker = Tracker(settings, config.filter, sensors.periods, use_identity=use_identity)
+        rows: list[Rows] = []
+        found = tracker.run(m, rows.append, lambda share: bar.working(label, share))
+        kept = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)
+        return rows, m, found, {s: estimate_noise(m, kept, s) for s in sources}
+
+    used = np.unique(plots.source[plots.reason == 0])
+    if any(not _configured(plots, s, sensors.configured[s]) for s in sources if s in used):
+        stretch = _first_stretch(plots)
+        well = replace(config.tracker, degraded_noise=1.0)  # larger errors are the noise sought, no condition
+        *_, estimates = run(stretch, "estimating noise", well)
+        for s in sources:
+            estimated = apply_estimate(noise[s], estimates[s], plots.sources[s])
+            noise[s] = replace(estimated, **sensors.configured[s])
+        rows, m, *_ = run(stretch, "checking noise", well)
+        for s in sources:
+            noise[s] = replace(widened(noise[s], _steady_d2(rows, m, s)), **sensors.configured[s])
+    rows, m, found, estimates = run(plots, "tracking", config.tracker)
+    return Tracked(rows, m, found, plane, noise, estimates)
+
+
+def _steady_d2(rows: Sequence[Rows], m: Measurements, s: int) -> _Array:
+    """Return the innovations of one source's updates in steady motion, as squared Mahalanobis distances."""
+    all_rows = join_rows(rows)
+    at = (all_rows.measurement >= 0) & (m.source[all_rows.measurement] == s)
+    return np.asarray(all_rows.d2[at & (all_rows.moments.p_manoeuvre_h < 0.5) & np.isfinite(all_rows.d2)])
+
+
+def _configured(plots: Plots, s: int, given: dict[str, float]) -> bool:
+    """Say whether the configuration gives every standard deviation that the source's reports need."""
+    return {field for _, field, _ in SIGMAS[reported_kind(plots, s)]} <= set(given)
+
+
+def _first_stretch(plots: Plots) -> Plots:
+    """Return the reports up to the time by which every source gave enough to estimate its noise from."""
+    last = 0
+    for s in range(len(plots.sources)):
+        own = np.flatnonzero((plots.source == s) & (plots.reason == 0))
+        last = max(last, int(own[min(len(own), _NOISE_PLOTS) - 1]) if len(own) else 0)
+    return plots.take(slice(0, last + 1))

@@ -1,0 +1,378 @@
+"""System tracks as published rows: who belongs together, states from all measurements, what became of each plot."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.tracks.bias import corrected
+from saltus.tracks.faults import PlotLaw, plot_law
+from saltus.tracks.fuse import Fused, LaneRows, fuse
+from saltus.tracks.kinematics import Moments
+from saltus.tracks.lifecycle import COASTED, CONFIRMED, TENTATIVE
+from saltus.tracks.local import LocalSystem
+from saltus.tracks.measurements import Measurements
+from saltus.tracks.membership import Segments
+from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.systems import Registered
+from saltus.tracks.tracker import Assignments, Rows, join_rows
+
+__all__ = ["Part", "SystemTracking", "track_systems"]
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.int64]
+_Mask = npt.NDArray[np.bool_]
+
+_SLACK = 0.6  # of a period: how late a plot may come before it counts as missed
+
+
+class Part(NamedTuple):
+    """What the tracker of one system found, and how the system was registered."""
+
+    system: LocalSystem
+    registered: Registered
+    m: Measurements
+    found: Assignments
+    rows: Rows
+    own: _Index  # sources of the system
+
+
+class SystemTracking(NamedTuple):
+    """System tracks over the measurements of all systems."""
+
+    rows: Rows
+    measurements: Measurements
+    assignments: Assignments
+
+
+class _Lanes(NamedTuple):
+    """Measurements of confirmed local tracks, sorted by system track, then by time."""
+
+    number: _Index  # measurement
+    track: _Index  # system track
+    local: _Index  # local track, through all systems
+    row: _Index  # row of the local tracker that this measurement gave, -1 none
+
+
+def track_systems(
+    parts: Sequence[Part],
+    segments: Segments,
+    lasting: float,
+    filters: FilterSettings,
+    settings: TrackerSettings,
+    periods: Sequence[float],
+    *,
+    use_identity: bool,
+) -> SystemTracking:
+    """Publish system tracks.
+
+    A system track that one local track of an unbiased system makes alone is published as its tracker left it. Every
+    other one is filtered anew from all measurements of its local tracks in exact time order, corrected for the biases
+    of their systems, from the state in which the first of them was published. Bearings stay with their own system.
+
+    Args:
+        parts: systems in the order in which local tracks are numbered.
+        segments: to which system track each local track belongs, and when.
+        lasting: standard deviation of what lasts between systems, m: added where systems meet in a track.
+        filters: manoeuvres.
+        settings: faults, coasting.
+        periods: update period of each source, s.
+        use_identity: whether tracks take over addresses and codes.
+    """
+    m, place = _merged(parts)
+    rows = join_rows([_renumbered(part, at) for part, at in zip(parts, place, strict=True)])
+    first = np.cumsum([0, *(len(p.system.ids) for p in parts)])
+    local, owner = _local_tracks(parts, place, first, len(m))
+    segment = np.full(len(m), -1)
+    known = np.flatnonzero(local >= 0)
+    raw_time = np.zeros(len(m))
+    for part, at in zip(parts, place, strict=True):
+        raw_time[at] = part.m.time
+    segment[known] = segments.at(local[known], raw_time[known])
+    of = (
+        np.where(segment >= 0, segments.system_track[segment], 0) if len(segments.track) else np.zeros(len(m), np.int64)
+    )
+    lanes = _lanes(m, of, local, rows)
+    alone = _published_as_left(parts, lanes, m, owner)
+    kept = _kept(rows, parts, first, segments, alone)
+    anew = _anew(lanes, alone, m, rows, parts, owner, lasting, (filters, settings), periods, use_identity=use_identity)
+    return SystemTracking(join_rows([kept, anew]), m, _assigned(parts, place, of, rows))
+
+
+def _merged(parts: Sequence[Part]) -> tuple[Measurements, list[_Index]]:
+    """Measurements of all systems, corrected, in time order, and where those of each part went."""
+    fixed = []
+    for part in parts:
+        found = part.registered.found
+        m = part.m if found is None else corrected(part.m, np.arange(len(part.m)), found.series)
+        fixed.append(m)
+    columns = {f.name: np.concatenate([getattr(m, f.name) for m in fixed]) for f in fields(Measurements)}
+    order = np.argsort(columns["time"], kind="stable")
+    where = np.empty(len(order), np.int64)
+    where[order] = np.arange(len(order))
+    edge = np.cumsum([0, *(len(m) for m in fixed)])
+    return Measurements(**{k: v[order] for k, v in columns.items()}), [where[a:b] for a, b in pairwise(edge)]
+
+
+def _renumbered(part: Part, at: _Index) -> Rows:
+    """Rows of one system with measurements numbered through all."""
+    rows = part.rows
+    measurement, named = (np.where(k >= 0, at[k], -1) if len(at) else k for k in (rows.measurement, rows.named))
+    return rows._replace(measurement=measurement, named=named)
+
+
+def _local_tracks(parts: Sequence[Part], place: Sequence[_Index], first: _Index, n: int) -> tuple[_Index, _Index]:
+    """Local track of each measurement through all systems (-1: none confirmed), and its part."""
+    local, owner = np.full(n, -1), np.zeros(n, np.int64)
+    for k, (part, at) in enumerate(zip(parts, place, strict=True)):
+        ids = part.system.ids
+        owner[at] = k
+        if len(ids):
+            found = np.minimum(np.searchsorted(ids, part.found.track_id), len(ids) - 1)
+            mine = ids[found] == part.found.track_id
+            local[at] = np.where(mine, first[k] + found, -1)
+    return local, owner
+
+
+def _lanes(m: Measurements, of: _Index, local: _Index, rows: Rows) -> _Lanes:
+    row = np.full(len(m), -1)
+    update = np.flatnonzero(rows.measurement >= 0)
+    row[rows.measurement[update]] = update
+    index = np.flatnonzero(of > 0)
+    index = index[np.lexsort((m.time[index], of[index]))]
+    return _Lanes(index, of[index], local[index], row[index])
+
+
+def _published_as_left(parts: Sequence[Part], lanes: _Lanes, m: Measurements, owner: _Index) -> _Mask:
+    """Say of each system track (by number, 0 unused) whether its one local track's own rows are published."""
+    count = int(lanes.track.max(initial=0)) + 1
+    fewest, most = np.full(count, np.iinfo(np.int64).max), np.full(count, -1)
+    np.minimum.at(fewest, lanes.track, lanes.local)
+    np.maximum.at(most, lanes.track, lanes.local)
+    moved = np.array(
+        [p.registered.found is not None and bool(p.registered.found.series.estimated.any()) for p in parts]
+    )
+    sights = np.array([bool(np.isfinite(p.m.bearing).any()) for p in parts])
+    biased = np.zeros(count, bool)
+    biased[lanes.track[(moved & ~sights)[owner[lanes.number]]]] = True
+    return np.asarray((fewest == most) & ~biased)
+
+
+def _kept(rows: Rows, parts: Sequence[Part], first: _Index, segments: Segments, alone: _Mask) -> Rows:
+    """Rows of local trackers under the number of their system track."""
+    local = np.concatenate(
+        [np.full(0, -1)]
+        + [
+            np.where(
+                np.isin(p.rows.track_id, p.system.ids), first[k] + np.searchsorted(p.system.ids, p.rows.track_id), -1
+            )
+            for k, p in enumerate(parts)
+        ]
+    )
+    at = np.flatnonzero(local >= 0)
+    if not len(segments.track):
+        return join_rows([])
+    of = segments.system_track[np.maximum(segments.at(local[at], rows.time[at]), 0)]
+    keep = alone[np.minimum(of, len(alone) - 1)] & (of < len(alone))
+    return _taken(rows, at[keep])._replace(track_id=of[keep])
+
+
+def _taken(rows: Rows, at: _Index) -> Rows:
+    moments = Moments(*(column[at] for column in rows.moments))
+    return Rows(moments=moments, **{n: getattr(rows, n)[at] for n in Rows._fields if n != "moments"})
+
+
+def _anew(
+    lanes: _Lanes,
+    alone: _Mask,
+    m: Measurements,
+    rows: Rows,
+    parts: Sequence[Part],
+    owner: _Index,
+    lasting: float,
+    rules: tuple[FilterSettings, TrackerSettings],
+    periods: Sequence[float],
+    *,
+    use_identity: bool,
+) -> Rows:
+    """Filter the other system tracks."""
+    filters, settings = rules
+    pick = ~alone[lanes.track] & np.isfinite(m.position[lanes.number, 0])
+    lanes = _Lanes(*(column[pick] for column in lanes))
+    started = _since(lanes.row >= 0, lanes.track)
+    lanes = _Lanes(*(column[started] for column in lanes))
+    if not len(lanes.number):
+        return join_rows([])
+    index, begin = lanes.number, np.flatnonzero(_first(lanes.track))
+    start = _start(rows, lanes, begin, m, parts, owner)
+    several = _several(lanes.track, owner[index])
+    cov = m.cov[index] * m.inflation[index, None, None]
+    cov[:, :2, :2] += (several * 0.5 * lasting**2)[:, None, None] * np.eye(2)
+    faulty = _faulty(m, index, settings, periods) + (cov - m.cov[index])[:, None]
+    lane = np.cumsum(_first(lanes.track)) - 1
+    updates = LaneRows(lane, m.time[index], m.position[index], cov, faulty)
+    every, measured = _coasting(updates, _periods(lanes, m, periods), settings)
+    fused = fuse(every, start, filters, settings)
+    return _published(every, measured, fused, lanes, m, rows, use_identity=use_identity)
+
+
+def _first(track: _Index) -> _Mask:
+    return np.asarray(np.diff(track, prepend=-1) != 0)
+
+
+def _since(event: _Mask, track: _Index) -> _Mask:
+    """Say of each row whether the event has happened in its lane, there included."""
+    if not len(track):
+        return np.zeros(0, bool)
+    count = np.cumsum(event)
+    first = np.maximum.accumulate(np.where(_first(track), np.arange(len(track)), 0))
+    return np.asarray(count - count[first] + event[first] > 0)
+
+
+def _several(track: _Index, owner: _Index) -> _Mask:
+    """Say of each row whether its lane holds measurements of several systems."""
+    count = int(track.max(initial=0)) + 1
+    low, high = np.full(count, np.iinfo(np.int64).max), np.full(count, -1)
+    np.minimum.at(low, track, owner)
+    np.maximum.at(high, track, owner)
+    return np.asarray(low[track] != high[track])
+
+
+def _start(rows: Rows, lanes: _Lanes, begin: _Index, m: Measurements, parts: Sequence[Part], owner: _Index) -> Moments:
+    """State of the local tracker at the first row of each lane, moved with the measurement it was made from."""
+    row, index = lanes.row[begin], lanes.number[begin]
+    raw, turn = np.empty((len(m), 2)), np.zeros(len(m))
+    for k, part in enumerate(parts):
+        own = np.flatnonzero(owner == k)  # in time order, as the part's, but for corrected times
+        back = _same_plots(m.plot[own], part.m.plot)
+        raw[own] = part.m.position[back, :2]
+        if part.registered.found is not None:
+            turn[own] = part.registered.found.series.at(part.m.time[back])[0][:, 2]
+    mean = rows.moments.mean[row].copy()
+    mean[:, [0, 2]] += m.position[index, :2] - raw[index]
+    c, s = np.cos(turn[index]), np.sin(turn[index])
+    vx, vy = mean[:, 1].copy(), mean[:, 3].copy()
+    mean[:, 1], mean[:, 3] = c * vx - s * vy, s * vx + c * vy
+    moments = rows.moments
+    return Moments(mean, moments.cov[row], moments.p_manoeuvre_h[row], moments.p_manoeuvre_v[row])
+
+
+def _same_plots(wanted: _Index, plots: _Index) -> _Index:
+    order = np.argsort(plots, kind="stable")
+    return np.asarray(order[np.searchsorted(plots[order], wanted)])
+
+
+def _faulty(m: Measurements, index: _Index, settings: TrackerSettings, periods: Sequence[float]) -> _Array:
+    """Covariances of plots with either fault, (k, 2, 3, 3): of azimuth and range, or of the position, twice."""
+    out = np.repeat(m.cov[index][:, None], 2, axis=1)
+    polar = np.isfinite(m.ray[index, 0])
+    for kind in (True, False):
+        law: PlotLaw = plot_law(settings, polar=kind)
+        at = np.flatnonzero(polar == kind)
+        faults = np.flatnonzero((law.condition == 0) & (law.fault > 0))
+        if len(at) and len(faults):
+            out[at] = law.covariances(m, index[at], faults)
+    return out
+
+
+def _periods(lanes: _Lanes, m: Measurements, periods: Sequence[float]) -> _Array:
+    """Shortest update period of the sources that each lane has had so far, s."""
+    own = np.asarray(periods, float)[m.source[lanes.number]]
+    out, first = own.copy(), np.flatnonzero(_first(lanes.track))
+    for a, b in zip(first, np.append(first[1:], len(own)), strict=True):
+        out[a:b] = np.minimum.accumulate(own[a:b])
+    return out
+
+
+def _coasting(updates: LaneRows, period: _Array, settings: TrackerSettings) -> tuple[LaneRows, _Index]:
+    """Put rows without measurement where one was expected; return all rows, and the update each of them is, -1 none."""
+    n = len(updates.lane)
+    last = np.append(updates.lane[1:] != updates.lane[:-1], True)
+    limit = np.maximum(settings.coast_scans * period, settings.coast_seconds)
+    ahead = np.where(last, limit, np.minimum(np.append(np.diff(updates.time), 0.0) - _SLACK * period, limit))
+    count = np.maximum(np.floor(ahead / period + 1e-9), 0).astype(np.int64)
+    source = np.repeat(np.arange(n), count)
+    number = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count) + 1
+    lane = np.concatenate([updates.lane, updates.lane[source]])
+    time = np.concatenate([updates.time, updates.time[source] + number * period[source]])
+    order = np.lexsort((time, lane))
+    measured = np.concatenate([np.arange(n), np.full(len(source), -1)])[order]
+    pick = np.concatenate([np.arange(n), source])[order]
+    position = np.where(measured[:, None] >= 0, updates.position[pick], np.nan)
+    return LaneRows(lane[order], time[order], position, updates.cov[pick], updates.faulty[pick]), measured
+
+
+def _published(
+    every: LaneRows,
+    measured: _Index,
+    fused: Fused,
+    lanes: _Lanes,
+    m: Measurements,
+    rows: Rows,
+    *,
+    use_identity: bool,
+) -> Rows:
+    at = np.maximum.accumulate(measured)  # the latest update; every lane begins with one
+    seen = measured >= 0
+    index, track = lanes.number[at], lanes.track[at]
+    known = (lanes.row >= 0) & (rows.status[np.maximum(lanes.row, 0)] == CONFIRMED)
+    sure = _since(known, lanes.track)[at]
+    status = np.where(seen, np.where(sure, CONFIRMED, TENTATIVE), COASTED)
+    nu = every.position[:, :2] - fused.centre
+    d2 = np.einsum("ki,kij,kj->k", nu, np.linalg.inv(fused.gate_cov), nu)
+    begun = _first(track)
+    d2[begun | ~seen | (np.nan_to_num(fused.p_fault) > 0.5)] = np.nan
+    nothing = np.full(len(lanes.number), -1)
+    icao24, mode3a = (_latest(c[lanes.number] if use_identity else nothing, lanes.track) for c in (m.icao24, m.mode3a))
+    named = np.where(m.named[lanes.number] & use_identity, lanes.number, -1)
+    keep = seen | sure  # a tentative track is not coasted
+    out = Rows(
+        track_id=track,
+        time=every.time,
+        moments=fused.moments,
+        status=status.astype(np.int8),
+        has_altitude=_since(np.isfinite(m.position[lanes.number, 2]), lanes.track)[at],
+        icao24=icao24[at].astype(np.int32),
+        mode3a=mode3a[at].astype(np.int16),
+        named=_latest(named, lanes.track)[at],
+        measurement=np.where(seen, index, -1),
+        centre=fused.centre,
+        gate_cov=fused.gate_cov,
+        d2=d2,
+        p_fault=_held(fused.p_fault, track),
+        fault=np.where(np.nan_to_num(fused.p_fault) > 0.5, 1, 0).astype(np.int8),
+    )
+    return _taken(out, np.flatnonzero(keep))
+
+
+def _latest(values: npt.NDArray[np.integer], track: _Index) -> _Index:
+    """The last value that is not negative, in each lane so far; -1 before."""
+    at = np.where(values >= 0, np.arange(len(values)), -1)
+    at = np.maximum.accumulate(at)
+    first = np.maximum.accumulate(np.where(_first(track), np.arange(len(values)), 0))
+    return np.asarray(np.where(at >= first, values[np.maximum(at, 0)], -1), np.int64)
+
+
+def _held(values: _Array, track: _Index) -> _Array:
+    """The last value that is a number, in each lane so far."""
+    at = _latest(np.where(np.isnan(values), -1, np.arange(len(values))), track)
+    return np.asarray(np.where(at >= 0, values[np.maximum(at, 0)], np.nan))
+
+
+def _assigned(parts: Sequence[Part], place: Sequence[_Index], of: _Index, rows: Rows) -> Assignments:
+    """What became of every measurement; local tracks never confirmed get numbers behind those of system tracks."""
+    track_id, n = of.copy(), len(of)
+    split, elsewhere = np.zeros(n, bool), np.zeros(n, bool)
+    above = int(of.max(initial=0))
+    sources = list(parts[0].found.sources)
+    for part, at in zip(parts, place, strict=True):
+        split[at], elsewhere[at] = part.found.split, part.found.elsewhere
+        rest = (of[at] == 0) & (part.found.track_id > 0)
+        track_id[at[rest]] = above + part.found.track_id[rest]
+        above += int(part.found.track_id.max(initial=0))
+        for s in part.own.tolist():
+            sources[s] = part.found.sources[s]
+    return Assignments(track_id, split, elsewhere, np.unique(of[of > 0]), sources)
