@@ -8,7 +8,9 @@ from saltus.tracks.fuse import LaneRows, fuse
 from saltus.tracks.kinematics import Moments
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
-ONE_MODE = FilterSettings(accel_h=(0.5,), sojourn_h=(100.0,), accel_v=(0.2,), sojourn_v=(100.0,), accel_time=4.0)
+ONE_MODE = FilterSettings(
+    accel_h=(0.5,), sojourn_h=(100.0,), turn_rate=(), accel_v=(0.2,), sojourn_v=(100.0,), accel_time=4.0
+)
 NO_FAULT = TrackerSettings(plot_outlier=1e-12, altitude_outlier=1e-12)
 
 
@@ -63,7 +65,7 @@ def test_one_mode_without_faults_is_the_dense_gaussian():
         np.testing.assert_allclose(found.moments.mean[-1, s], mean, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(found.moments.cov[-1, s, s], cov, rtol=1e-5)
     np.testing.assert_array_equal(found.moments.mean[0], start.mean[0])
-    assert np.isnan(found.p_fault[3])
+    assert np.isnan(found.p_fault[3]).all()
 
 
 def test_lanes_do_not_know_each_other():
@@ -97,7 +99,7 @@ def test_wrong_plot_is_seen_and_moves_little():
     z[14, 2] += 2000.0  # a garbled height
     start = start_at([0.0, 100.0, 0.0, 20.0, 3000.0, 0.0])
     found = fuse(rows(np.zeros(20, int), time, z, 10.0), start, FilterSettings(accel_time=2.0), TrackerSettings())
-    assert found.p_fault[10] > 0.99
+    assert found.p_fault[10].sum() > 0.99
     assert np.nanmax(np.delete(found.p_fault, 10)) < 0.01
     assert np.abs(found.moments.mean[:, :4:2] - true[:, :2]).max() < 10.0
     assert np.abs(found.moments.mean[:, 4] - 3000.0).max() < 10.0
@@ -142,6 +144,6 @@ def test_either_form(form):
         rows(np.zeros(10, int), time, z, 15.0), start_at([0, 50, 0, -20, 1000, 5]), FilterSettings(form=form),
         TrackerSettings(),
     )  # fmt: skip
-    np.testing.assert_allclose(found.moments.mean[-1], [1350, 50, -540, -20, 1135, 5], atol=1e-6)
+    np.testing.assert_allclose(found.moments.mean[-1], [1350, 50, -540, -20, 1135, 5], atol=0.05)
     assert (np.linalg.eigvalsh(found.moments.cov) > 0).all()
     assert (found.moments.p_manoeuvre_h[1:] > 0).all()

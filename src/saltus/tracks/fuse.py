@@ -35,7 +35,7 @@ class Fused(NamedTuple):
     moments: Moments
     centre: Float[np.ndarray, "n 2"]  # predicted position
     gate_cov: Float[np.ndarray, "n 2 2"]  # covariance of the innovation of a good plot
-    p_fault: Float[np.ndarray, " n"]  # probability that the plot was faulty; NaN without one
+    p_fault: Float[np.ndarray, "n f"]  # probability of each fault of the plot; NaN without one
 
 
 class _Batch(NamedTuple):
@@ -62,7 +62,7 @@ def fuse(rows: LaneRows, start: Moments, filters: FilterSettings, settings: Trac
     n, first = len(rows.lane), np.flatnonzero(np.diff(rows.lane, prepend=-1))
     mean, cov = np.zeros((n, 6)), np.zeros((n, 6, 6))
     manoeuvre = {"horizontal": np.zeros(n), "vertical": np.zeros(n)}
-    p_fault = np.full(n, np.nan)
+    p_fault = np.full((n, rows.faulty.shape[1]), np.nan)
     centre, gate_cov = rows.position[:, :2].copy(), rows.cov[:, :2, :2].copy()
     begun = {"horizontal": start.p_manoeuvre_h, "vertical": start.p_manoeuvre_v}
     for channel in make_kinematics(filters).channels:
@@ -127,7 +127,9 @@ def _filter(
     F, Q = (a.reshape((*batch.shape, *a.shape[1:-2], 1, *a.shape[-2:])) for a in (over.F, over.Q))
     H = np.zeros((len(axes), 2 * len(axes)))
     H[np.arange(len(axes)), 2 * np.arange(len(axes))] = 1.0
-    trans = [np.ones((*batch.shape, 1, 1)) if t is None else t.reshape((*batch.shape, *t.shape[1:])) for t in over.trans]
+    trans = [
+        np.ones((*batch.shape, 1, 1)) if t is None else t.reshape((*batch.shape, *t.shape[1:])) for t in over.trans
+    ]
     ones = (1,) * n_chains
     found = imm_filter(
         z,
@@ -148,7 +150,7 @@ def _filter(
         manoeuvre[chain.name][row] = 1.0 - probs.sum(axis=others)[:, 0]
     if horizontal:
         seen = np.isfinite(rows.position[row, 0])
-        p_fault[row] = np.where(seen, 1.0 - probs.sum(axis=tuple(range(1, 1 + n_chains)))[:, 0], np.nan)
+        p_fault[row] = np.where(seen[:, None], probs.sum(axis=tuple(range(1, 1 + n_chains)))[:, 1:], np.nan)
         before = _begun(channel, begun, batch.lanes, law).sum(axis=-1)[:, None]
         before = np.concatenate([before, found.probs.sum(axis=-1)[:, :-1]], axis=1)[batch.at]
         ahead = _ahead(before, [t[batch.at] for t in trans])

@@ -323,8 +323,10 @@ def _published(
     status = np.where(seen, np.where(sure, CONFIRMED, TENTATIVE), COASTED)
     nu = every.position[:, :2] - fused.centre
     d2 = np.einsum("ki,kij,kj->k", nu, np.linalg.inv(fused.gate_cov), nu)
-    begun = _first(track)
-    d2[begun | ~seen | (np.nan_to_num(fused.p_fault) > 0.5)] = np.nan
+    wrong = fused.p_fault.sum(axis=1)
+    d2[_first(track) | ~seen | (np.nan_to_num(wrong) > 0.5)] = np.nan
+    polar = np.isfinite(m.ray[index, 0])
+    likeliest = np.where(polar & (fused.p_fault[:, -1] > fused.p_fault[:, 0]), 2, 1)
     nothing = np.full(len(lanes.number), -1)
     icao24, mode3a = (_latest(c[lanes.number] if use_identity else nothing, lanes.track) for c in (m.icao24, m.mode3a))
     named = np.where(m.named[lanes.number] & use_identity, lanes.number, -1)
@@ -342,8 +344,8 @@ def _published(
         centre=fused.centre,
         gate_cov=fused.gate_cov,
         d2=d2,
-        p_fault=_held(fused.p_fault, track),
-        fault=np.where(np.nan_to_num(fused.p_fault) > 0.5, 1, 0).astype(np.int8),
+        p_fault=_held(wrong, track),
+        fault=np.where(seen & np.isfinite(wrong), likeliest, 0).astype(np.int8),
     )
     return _taken(out, np.flatnonzero(keep))
 
