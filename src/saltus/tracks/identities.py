@@ -31,6 +31,7 @@ _Index = npt.NDArray[np.int64]
 
 _SCALES = ((1.0, 0.7), (3.0, 0.2), (10.0, 0.07), (30.0, 0.03))  # of the lasting difference, with probabilities
 _REACH = 4.0  # standard deviations of a residual within which tracks may be one object
+_ROWS = 8.0  # of the slower system that a window holds at least
 _LARGE = 10.0  # of the lasting difference: so far it may reach
 
 
@@ -60,7 +61,7 @@ def identify(
                 continue
             wide = [float(np.quantile(np.trace(t.R, axis1=-2, axis2=-1), 0.9)) for t in (a, b)]
             reach = _REACH * float(np.sqrt(sum(wide) + 2.0 * (_LARGE * lasting) ** 2))
-            found = _mixed(a, b, pairing, reach, settings.window)
+            found = _mixed(a, b, pairing, reach, max(settings.window, _ROWS * max(_interval(a), _interval(b))))
             gain = _identity(systems[i], systems[j], found.pairs)
             parts.append((found._replace(llr=found.llr + gain[found.pair]), int(first[i]), int(first[j])))
     evidence = join_evidence(parts)
@@ -73,6 +74,12 @@ def identify(
         hysteresis=settings.hysteresis,
     )
     return decide_pairs(evidence, number, rule, address=address), evidence
+
+
+def _interval(tracks: LocalTracks) -> float:
+    """Median interval between the rows of a track, s."""
+    step = np.diff(tracks.time)[np.diff(tracks.track) == 0]
+    return float(np.median(step)) if len(step) else 0.0
 
 
 def _at_once(systems: Sequence[LocalSystem]) -> float:
