@@ -1,7 +1,6 @@
 """Many multimode filters at once: rows that are added, stepped, scored, updated and removed as arrays."""
 
 from collections.abc import Sequence
-from copy import copy
 from math import prod
 from typing import Any, Protocol, runtime_checkable
 
@@ -80,7 +79,8 @@ class Bank:
 
     def take(self, rows: _Rows) -> "Bank":
         """Return a new bank whose rows 0..k-1 are copies of `rows` (repeats allowed: hypotheses, resampling)."""
-        bank = copy(self)
+        bank = Bank.__new__(Bank)  # nothing to check again, and no room to make twice
+        bank.n, bank.sizes, bank.backend = self.n, self.sizes, self.backend
         bank._store, bank._capacity, bank._free = self._store.take(rows), len(rows), []
         return bank
 

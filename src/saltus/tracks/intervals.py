@@ -12,7 +12,7 @@ __all__ = ["Intervals", "Matrices"]
 
 _Array = npt.NDArray[np.float64]
 
-_MOST = 2048  # intervals remembered, a few MB; then it begins anew
+_MOST = 4096  # intervals remembered, some MB; then it begins anew
 
 
 class Matrices(NamedTuple):
@@ -24,22 +24,22 @@ class Matrices(NamedTuple):
 
 
 class Intervals:
-    """F, Q and transition matrices of a motion and its chains, computed once for each length of interval."""
+    """F, Q and transition matrices of motions and their chains, computed once for each length of interval."""
 
-    def __init__(self, motion: Motion, chains: Sequence[Chain]) -> None:
-        """Begin with the interval of length 0; `motion` is bound to the chains."""
-        self._motion, self._chains = motion, chains
+    def __init__(self, parts: Sequence[tuple[Motion, Sequence[Chain]]]) -> None:
+        """Begin with the interval of length 0; every motion is bound to the chains that go with it."""
+        self._parts = parts
         self._known: _Array = np.zeros(0)  # ascending
         self._row: npt.NDArray[np.intp] = np.zeros(0, np.intp)  # of the columns, for each known interval
-        self._columns: list[_Array] = []  # F, Q, transitions; with room for more
+        self._columns: list[_Array] = []  # F, Q, transitions of each part; with room for more
         self._learn(np.zeros(1))
 
     def __len__(self) -> int:
         """Number of intervals remembered."""
         return len(self._known)
 
-    def at(self, dt: _Array) -> Matrices:
-        """Return the matrices over intervals dt (k,), s."""
+    def at(self, dt: _Array) -> tuple[Matrices, ...]:
+        """Return the matrices over intervals dt (k,), s, of each part."""
         place = self._places(dt)
         if (place < 0).any():
             if len(self._known) > _MOST:
@@ -47,12 +47,11 @@ class Intervals:
                 place[:] = -1
             self._learn(np.unique(dt[place < 0]))
             place = self._places(dt)
-        F, Q = (column[place] for column in self._columns[:2])
-        return Matrices(F, Q, self._trans(place))
-
-    def _trans(self, place: npt.NDArray[np.intp]) -> list[_Array | None]:
-        columns = iter(self._columns[2:])
-        return [None if len(chain) == 1 else next(columns)[place] for chain in self._chains]
+        columns = (column[place] for column in self._columns)
+        return tuple(
+            Matrices(next(columns), next(columns), [None if len(chain) == 1 else next(columns) for chain in chains])
+            for _, chains in self._parts
+        )
 
     def _places(self, dt: _Array) -> npt.NDArray[np.intp]:
         """Rows of the columns that hold dt, -1 for none."""
@@ -60,8 +59,9 @@ class Intervals:
         return np.where(self._known[at] == dt, self._row[at], -1)
 
     def _learn(self, dt: _Array) -> None:
-        F, Q, _ = self._motion.step(dt)
-        new = [F, Q, *(chain.transition(dt) for chain in self._chains if len(chain) > 1)]
+        new = []
+        for motion, chains in self._parts:
+            new += [*motion.step(dt)[:2], *(chain.transition(dt) for chain in chains if len(chain) > 1)]
         begin, end = len(self._known), len(self._known) + len(dt)
         if not self._columns or end > len(self._columns[0]):
             old, room = self._columns, max(2 * end, 64)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from saltus.errors import NumericalError
 from saltus.filters import Bank, Belief
 from saltus.models import Chain, Motion, constant_velocity
-from saltus.tracks.intervals import Intervals
+from saltus.tracks.intervals import Intervals, Matrices
 from saltus.tracks.modes import Mode, horizontal_chain, vertical_chain
 from saltus.tracks.settings import FilterSettings
 
@@ -59,7 +59,7 @@ class Channel:
     axes: npt.NDArray[np.intp]
     chains: tuple[Chain, ...]
     states: npt.NDArray[np.intp]  # positions of the channel's states among the six
-    intervals: Intervals  # of the motion and the chains
+    motion: Motion  # bound to the chains
     turns: tuple[int, ...]  # states of the first chain that turn
     bank: Bank
 
@@ -78,10 +78,9 @@ class Channel:
             np.broadcast_to(cov, (k, *sizes, n, n)),
         )
 
-    def predicted(self, rows: _Rows, dt: _Array) -> "Channel":
-        """Copies of rows, numbered from 0, mixed and moved forward by dt."""
+    def predicted(self, rows: _Rows, over: Matrices) -> "Channel":
+        """Copies of rows, numbered from 0, mixed and moved forward over intervals."""
         ahead = self.bank.take(rows)
-        over = self.intervals.at(dt)
         ahead.step(np.arange(len(rows)), over.trans, over.F, None, over.Q)
         return replace(self, bank=ahead)
 
@@ -123,6 +122,7 @@ class Kinematics:
     """
 
     channels: tuple[Channel, ...]
+    intervals: Intervals  # of the channels
 
     def add(self, start: Start) -> _Rows:
         """Store new rows."""
@@ -143,7 +143,8 @@ class Kinematics:
 
     def predicted(self, rows: _Rows, dt: _Array) -> "Kinematics":
         """Copies of rows (repeats allowed), numbered from 0, moved forward by dt >= 0."""
-        return Kinematics(tuple(channel.predicted(rows, dt) for channel in self.channels))
+        parts = zip(self.channels, self.intervals.at(dt), strict=True)
+        return Kinematics(tuple(channel.predicted(rows, over) for channel, over in parts), self.intervals)
 
     def update(self, rows: _Rows, plan: Plan) -> None:
         """Condition rows on measurements."""
@@ -219,10 +220,14 @@ def make_kinematics(settings: FilterSettings) -> Kinematics:
             kind=kind,
             turn=turn,
         )
-        return Kinematics((_channel([0, 1, 2], (h, v), motion),))
+        return _kinematics(_channel([0, 1, 2], (h, v), motion))
     horizontal = constant_velocity(2, accel=lambda horizontal: horizontal.accel, kind=kind, turn=turn)
     vertical = constant_velocity(1, accel=lambda vertical: vertical.accel, kind=kind)
-    return Kinematics((_channel([0, 1], (h,), horizontal), _channel([2], (v,), vertical)))
+    return _kinematics(_channel([0, 1], (h,), horizontal), _channel([2], (v,), vertical))
+
+
+def _kinematics(*channels: Channel) -> Kinematics:
+    return Kinematics(channels, Intervals([(channel.motion, channel.chains) for channel in channels]))
 
 
 def _channel(axes: list[int], chains: tuple[Chain, ...], motion: Motion) -> Channel:
@@ -230,7 +235,7 @@ def _channel(axes: list[int], chains: tuple[Chain, ...], motion: Motion) -> Chan
     position = 2 * np.array(axes)
     states = np.stack([position, position + 1], axis=-1).ravel()
     turns = tuple(k for k, mode in enumerate(chains[0].values) if isinstance(mode, Mode) and mode.turn)
-    return Channel(np.array(axes), chains, states, Intervals(motion.bind(chains), chains), turns, bank)
+    return Channel(np.array(axes), chains, states, motion.bind(chains), turns, bank)
 
 
 def two_point_start(first: _Array, first_cov: _Array, second: _Array, second_cov: _Array, dt: _Array) -> Start:
