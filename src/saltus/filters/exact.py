@@ -6,7 +6,9 @@ keeps their number down is one rule with three settings (`MergingRule`): histori
 by their moments, after the update or between branching and propagation, and the `most` probable ones are kept.
 
     exact: merge nothing          GPB1: last=0, after        GPB2: last=1, after        IMM: last=1, before
-    k-best: most=k                GPBn: last=n-1, after      deeper IMM: last=n, before
+    k-best: most=k                GPBn: last=n-1, after
+
+From two modes on, before and after are the same: given the mode before it, the newest says nothing of older ones.
 
 The filter's own error is what its rule threw away, in nats. Dropping histories of mass delta costs -log(1 - delta);
 merging the histories h of a group g, weights w, at most sum_g 1/2 [w_g log det P_g - sum_h w_h log det P_h]. With

@@ -152,7 +152,7 @@ def candidates(problem: Problem, particles: int) -> dict[str, Contender]:
     if problem.linear:
         return {
             "GPB2": _by_rule(GPB2),
-            "IMM on two modes back": _by_rule(MergingRule(last=2, before=True)),
+            "GPB3": _by_rule(MergingRule(last=2)),
             "the 30 best histories": _by_rule(MergingRule(most=30)),
             "100 Rao-Blackwellised particles": _particles(100),
         }
