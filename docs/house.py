@@ -10,6 +10,7 @@ WORDS = {
     "run": "recordings to tracks",
     "info": "what is in a recording",
     "score": "tracks against the truth",
+    "injection": "faults put into recordings, and found again",
     "diagnose": "what noise a recording has",
     "gap": "how far a filter is from the optimum",
     "summary": "a run in numbers",

@@ -16,7 +16,7 @@ from saltus.records import Kind, Plots
 from saltus.tracks.health import Health, sensor_health
 from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
-from saltus.tracks.tracker import Assignments, Rows
+from saltus.tracks.tracker import Assignments, Rows, join_rows
 
 __all__ = ["SIGMAS", "Sensors", "Tracked", "health_of", "noise_rows", "reported_kind", "show_summary", "summarise"]
 
@@ -134,17 +134,12 @@ def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, 
 def health_of(sensors: Sensors, tracked: Tracked) -> list[Health]:
     """Gather the faults that the tracker found, by source."""
     m, confirmed = tracked.measurements, tracked.assignments.confirmed
-    parts = [rows for rows in tracked.rows if len(rows.time)]
-    columns = {
-        name: np.concatenate([np.zeros(0, int), *(getattr(rows, name) for rows in parts)])
-        for name in ("measurement", "track_id", "p_fault", "fault")
-    }
-    at = (columns["measurement"] >= 0) & np.isin(columns["track_id"], confirmed)
-    plot = columns["measurement"][at].astype(np.intp)
-    own = np.isnan(m.bearing[plot])  # a bearing says nothing of faults: its row repeats the last plot's
-    p, fault = columns["p_fault"][at][own], columns["fault"][at][own].astype(np.int8)
-    plot = plot[own]
-    return sensor_health(sensors.names, tracked.assignments.sources, m.source[plot], m.time[plot], p, fault)
+    rows = join_rows(tracked.rows)
+    at = np.flatnonzero((rows.measurement >= 0) & np.isin(rows.track_id, confirmed))
+    at = at[np.isnan(m.bearing[rows.measurement[at]])]  # a bearing says nothing of faults: it repeats the last plot's
+    plot = rows.measurement[at]
+    found = rows.p_fault[at], rows.fault[at]
+    return sensor_health(sensors.names, tracked.assignments.sources, m.source[plot], m.time[plot], *found)
 
 
 def _fault_table(sensors: Sequence[Health]) -> dict[str, object]:

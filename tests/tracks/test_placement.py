@@ -8,7 +8,7 @@ from saltus.config import SensorConfig
 from saltus.errors import DataError
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots, Source, System
-from saltus.run import _noise
+from saltus.run.command import _noise
 from saltus.tracks.measurements import Noise, make_plane, place_plots
 
 N = 30

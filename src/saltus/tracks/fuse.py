@@ -7,6 +7,7 @@ import numpy.typing as npt
 from jaxtyping import Float, Int
 
 from saltus.filters import imm_filter
+from saltus.tracks.intervals import Intervals
 from saltus.tracks.kinematics import Channel, Moments, make_kinematics
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
@@ -123,7 +124,7 @@ def _filter(
     R = np.broadcast_to(np.eye(len(axes)), (*batch.shape, kinds, len(axes), len(axes))).copy()
     R[batch.at] = np.concatenate([good[:, None], faulty], axis=1)
     law = np.array([1.0 - p, *([p / (kinds - 1)] * (kinds - 1))])
-    over = channel.intervals.at(dt.ravel())
+    (over,) = Intervals([(channel.motion, channel.chains)]).at(dt.ravel())
     F, Q = (a.reshape((*batch.shape, *a.shape[1:-2], 1, *a.shape[-2:])) for a in (over.F, over.Q))
     H = np.zeros((len(axes), 2 * len(axes)))
     H[np.arange(len(axes)), 2 * np.arange(len(axes))] = 1.0

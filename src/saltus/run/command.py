@@ -17,16 +17,16 @@ from saltus import io
 from saltus.config import Config, SensorConfig, load_config, parse_date
 from saltus.errors import DataError
 from saltus.geo import Site
-from saltus.identified import bias_tables, conflict_lines, identification_summary, identification_table
 from saltus.io.write import output_directory
-from saltus.pipeline import Identified, track_plots
 from saltus.progress import Progress, progress_bar
 from saltus.records import REASONS, Kind, Plots, Recording, Source
+from saltus.run.identified import bias_tables, conflict_lines, identification_summary, identification_table
+from saltus.run.pipeline import Identified, track_plots
 from saltus.summary import Sensors, Tracked, health_of, noise_rows, show_summary, summarise
 from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.tracker import Rows, join_rows
 
-__all__ = ["track_files", "track_recording"]
+__all__ = ["parse_time", "track_files", "track_recording"]
 
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 _DAY = 86400.0  # s

@@ -11,8 +11,8 @@ from saltus.geo import Plane
 from saltus.identify import Decisions, Episodes, Evidence, join_evidence
 from saltus.progress import Progress
 from saltus.records import REASONS, Plots
+from saltus.run.tracking import track_system
 from saltus.summary import Sensors, Tracked
-from saltus.tracking import track_system
 from saltus.tracks.identities import identify
 from saltus.tracks.local import LocalSystem, Party, foreign_systems, group_sources, local_system
 from saltus.tracks.measurements import make_plane

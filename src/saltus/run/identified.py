@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.pipeline import Identified
+from saltus.run.pipeline import Identified
 from saltus.tracks.bias import PARAMETERS
 from saltus.tracks.systems import Registered
 
