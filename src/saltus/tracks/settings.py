@@ -177,8 +177,8 @@ class SystemsSettings:
     reference: str = ""
     p_false: float = 1e-3
     p_false_split: float = 1e-6
-    hysteresis: float = 2.0
-    window: float = 80.0
+    hysteresis: float = 5.0
+    window: float = 120.0
     settle: float = 12.0
     offset_time: float = 60.0
     spacing: float = 10.0
