@@ -6,12 +6,12 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from tracking_scenes import SITE, measured, observed, polar_noise, run
+from tracking_scenes import SITE, flights, measured, observed, polar_noise, run
 
 from saltus.errors import ModelError
 from saltus.geo import Plane
 from saltus.simulate import Leg, Radar, Trajectory, observe
-from saltus.tracks.faults import History, SourceCondition, plot_law
+from saltus.tracks.faults import History, SourceCondition, plot_law, voice
 from saltus.tracks.health import degraded_intervals, sensor_health
 from saltus.tracks.settings import TrackerSettings
 
@@ -54,7 +54,8 @@ def test_a_fault_widens_what_it_makes_wrong(rng):
         np.testing.assert_allclose(found[:, h, :2, :2], expected, rtol=1e-9, atol=1e-6)
         np.testing.assert_array_equal(found[:, h, 2], cov[:, 2])
     assert len(set(zip(law.condition.tolist(), law.fault.tolist(), strict=True))) == 12
-    np.testing.assert_allclose(np.exp(law.log_fault[:3]), [0.98, 0.01, 0.01])
+    # A radar's plots err as it does: the condition of each is the radar's.
+    np.testing.assert_allclose(np.exp(law.log_own), np.kron(np.eye(4), [0.98, 0.01, 0.01]), atol=1e-15)
 
 
 def test_positions_are_wrong_as_a_whole():
@@ -63,15 +64,25 @@ def test_positions_are_wrong_as_a_whole():
     found = law.covariances(m, np.arange(1))[0, :, :2, :2]
     variances = [900.0, 900.0 + 200.0**2, 16 * 900.0, 16 * 900.0 + 200.0**2]
     np.testing.assert_allclose(found, np.array(variances)[:, None, None] * np.eye(2), rtol=1e-12)
+    # One in two hundred errs as under a degraded source while that is well.
+    np.testing.assert_allclose(
+        np.exp(law.log_own), [[0.995 * 0.99, 0.995 * 0.01, 0.005 * 0.99, 0.005 * 0.01], [0.0, 0.0, 0.99, 0.01]]
+    )
+    alone = plot_law(replace(SETTINGS, degraded_noise=1.0), polar=False)
+    np.testing.assert_allclose(np.exp(alone.log_own), [[0.99, 0.01]])
 
 
 @pytest.mark.parametrize("polar", [True, False])
 def test_the_condition_is_that_of_all_sequences(rng, polar):
-    """Three scans of two confirmed tracks and a tentative one: every sequence of conditions and faults, enumerated."""
+    """Three scans of two confirmed tracks and a tentative one: every sequence of conditions and faults, enumerated.
+
+    One of the two was seen a second before and counts as a quarter of a plot.
+    """
     law = plot_law(SETTINGS, polar=polar)
     source, times = SourceCondition(law, SETTINGS), [0.0, 7.0, 11.0]
     log_f = rng.normal(-10.0, 3.0, (3, 3, len(law.fault)))
-    known = np.array([True, True, False])
+    heard = voice(np.array([True, True, False]), np.array([9.0, 1.0, 9.0]))
+    np.testing.assert_array_equal(heard, [1.0, 0.25, 0.0])
     rate = 1.0 / np.array(SETTINGS.degraded_sojourn)
     generator = np.array([[-rate[0], rate[0]], [rate[1], -rate[1]]])
     share = rate[0] / rate.sum()
@@ -83,24 +94,34 @@ def test_the_condition_is_that_of_all_sequences(rng, polar):
     first = np.where(law.degraded, share, 1 - share).prod(axis=1)
     trans = [chain(7.0), chain(4.0)]
     q = len(first)
-    of = [
-        np.array([[np.exp(log_f[k, i] + law.log_fault)[law.condition == c].sum() for c in range(q)] for i in range(3)])
-        for k in range(3)
-    ]
+    rough, p = (0.0, [0.98, 0.01, 0.01]) if polar else (0.005, [0.99, 0.01])
+
+    def own(c, i, k):
+        """Joint densities of plot i and its hypotheses, the source in condition c."""
+        given = [
+            np.prod(
+                [(rough if b else 1 - rough) if not a else float(b) for a, b in zip(law.degraded[c], d, strict=True)]
+            )
+            for d in law.degraded[law.condition]
+        ]
+        return np.exp(log_f[k, i]) * np.array(p)[law.fault] * given
+
+    of = [np.array([[own(c, i, k).sum() for c in range(q)] for i in range(3)]) for k in range(3)]
+    # What a plot says of the source: with probability 0.05 nothing, and then it is as likely as it can be.
+    told = [(0.95 * f + 0.05 * f.max(axis=1, keepdims=True)) ** heard[:, None] for f in of]
     for k in range(3):
         weight = np.zeros((q, 3, len(law.fault)))  # joint law of the last condition and each plot's hypothesis
         posterior = np.zeros(q)
         for path in product(range(q), repeat=k + 1):
-            p = first[path[0]] * np.prod([trans[s][path[s], path[s + 1]] for s in range(k)])
+            weigh = first[path[0]] * np.prod([trans[s][path[s], path[s + 1]] for s in range(k)])
             for s in range(k):
-                p *= of[s][:2, path[s]].prod()
-            posterior[path[-1]] += p * of[k][:2, path[-1]].prod()
+                weigh *= told[s][:2, path[s]].prod()
+            posterior[path[-1]] += weigh * told[k][:2, path[-1]].prod()
             for i in range(3):
-                others = np.prod([of[k][j, path[-1]] for j in (0, 1) if j != i])
-                own = np.exp(log_f[k, i] + law.log_fault) * (law.condition == path[-1])
-                weight[path[-1], i] += p * others * own
+                others = np.prod([told[k][j, path[-1]] for j in (0, 1) if j != i])
+                weight[path[-1], i] += weigh * others * own(path[-1], i, k)
         prior = source.predicted(times[k])
-        weights = source.absorb(times[k], prior, log_f[k], known)
+        weights = source.absorb(times[k], prior, log_f[k], heard)
         np.testing.assert_allclose(source.history.probs[k], posterior / posterior.sum(), rtol=1e-9)
         found = np.exp(weights + log_f[k])
         expected = weight.sum(axis=0)
@@ -112,7 +133,7 @@ def test_the_condition_is_that_of_all_sequences(rng, polar):
 def test_tentative_tracks_say_nothing_of_a_source(rng):
     source = SourceCondition(plot_law(SETTINGS, polar=True), SETTINGS)
     prior = source.predicted(0.0)
-    source.absorb(0.0, prior, rng.normal(size=(4, 12)) * 50.0, np.zeros(4, bool))
+    source.absorb(0.0, prior, rng.normal(size=(4, 12)) * 50.0, np.zeros(4))
     assert len(source.history.time) == 0
     np.testing.assert_array_equal(source.predicted(100.0), prior)
 
@@ -216,6 +237,51 @@ def test_a_degraded_radar_is_told_from_turns_and_outliers(rng, component, name):
     straight = (np.isin(rows.measurement, bad[label[bad] >= 3])), np.isin(off.measurement, bad[label[bad] >= 3])
     p_known, p_off = rows.moments.p_manoeuvre_h[straight[0]].mean(), off.moments.p_manoeuvre_h[straight[1]].mean()
     assert p_known < 0.3 < p_off
+
+
+@pytest.mark.parametrize("wrong", [0, 1])
+def test_a_track_begun_with_a_fault_begins_anew_as_another(rng, wrong):
+    """An azimuth off by two degrees in one of the first two plots: no row of the track comes from it."""
+    m, label = flown(rng, seconds=60.0)
+    mine = np.flatnonzero(label == 6)
+    m = replace(moved(m, mine[[wrong]], azimuth=np.radians(2.0)), icao24=(1000 + label).astype(np.int32))
+    found = run(m)
+    rows = found.rows
+    assert set(found.track_id[mine[:2]]) == {0}
+    assert len(set(found.track_id[mine[2:]])) == 1 and found.track_id[mine[2]] > 0
+    speed = np.hypot(rows.moments.mean[:, 1], rows.moments.mean[:, 3])[np.isin(rows.measurement, mine)]
+    assert len(speed) == len(mine) - 3  # a first plot gives no row
+    np.testing.assert_allclose(speed, 200.0, atol=30.0)
+    assert len(np.unique(found.track_id[found.track_id > 0])) == 10
+
+
+def reports(rng, bad):
+    """Eight aircraft that tell their positions every second; errors of 5 m, 30 m where `bad` says so of (8, 180)."""
+    times = np.arange(180.0)
+    angle = np.arange(8) * 0.785
+    start = 20e3 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    t, xy = flights(start, 100.0 * np.stack([-np.sin(angle), np.cos(angle)], axis=-1), times)
+    xy = xy + 5.0 * rng.standard_normal(xy.shape) * np.where(bad, 6.0, 1.0).reshape(-1, 1)
+    return measured(t + np.repeat(0.01 * np.arange(8), 180), xy, 5.0, icao24=np.repeat(np.arange(8), 180))
+
+
+def test_reports_every_second_tell_a_jammed_source_within_a_few_scans(rng):
+    bad = np.broadcast_to((np.arange(180) >= 80) & (np.arange(180) < 120), (8, 180))
+    source = run(reports(rng, bad), periods=(1.0,)).raw.sources[0]
+    (spell,) = degraded_intervals(source.history, source.law)
+    assert 80.0 <= spell.time_from <= 84.0
+    assert 118.0 <= spell.time_to <= 126.0
+
+
+def test_a_bad_transmitter_is_not_the_source(rng):
+    """One of eight errs six times as much all the time."""
+    bad = np.zeros((8, 180), bool)
+    bad[3] = True
+    found = run(reports(rng, bad), periods=(1.0,))
+    source = found.raw.sources[0]
+    assert degraded_intervals(source.history, source.law) == []
+    assert source.history.probs[:, 1].max() < 0.1
+    assert len(np.unique(found.track_id[found.track_id > 0])) == 8
 
 
 def test_a_radar_that_is_well_stays_so(rng):

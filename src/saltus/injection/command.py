@@ -138,6 +138,9 @@ def _show(metrics: dict[str, object]) -> None:
     assert isinstance(figures, dict) and isinstance(grown, dict) and isinstance(p, dict)
     click.echo(f"reference: {metrics['reference']}")
     click.echo(f"{'':32}{'clean':>9}{'faulty':>9}{'growth':>9}{'without chains':>16}{'growth':>9}")
+    for name in ("plots_straight", "plots_turn"):
+        counts = [figures[run][name] for run in ("clean_with", "injected_with", "injected_without")]
+        click.echo(f"{name:32}{counts[0]:9.0f}{counts[1]:9.0f}{'':9}{counts[2]:16.0f}")
     for name in grown["with"]:
         values = [figures[run][name] for run in ("clean_with", "injected_with", "injected_without")]
         more = [grown[chains][name] for chains in ("with", "without")]

@@ -17,13 +17,16 @@ from saltus.linalg import logsumexp
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import TrackerSettings
 
-__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law"]
+__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law", "voice"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
 _FAULTY_SHARE = 0.1  # of the range: faults scale with what a radar covers
 _LIVE = 0.01  # probability of a condition from which gates reckon with it
+_OWN_AFFAIR = 0.05  # probability that the error of a plot is its target's own affair and tells nothing of the source
+_LASTING = 4.0  # s that errors of one target last: it is heard once in that time
+_ROUGH = 0.005  # of positions that transmitters tell err as under a degraded source, each by itself
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +37,7 @@ class PlotLaw:
     degraded: npt.NDArray[np.bool_]  # (q, components): what each condition of the source degrades; the first nothing
     condition: _Index  # (h,)
     fault: npt.NDArray[np.int8]  # (h,): 0 none, else 1 + the component
-    log_fault: _Array  # (h,): logarithm of the probability of the plot's own state
+    log_own: _Array  # (q, h): log probability of the hypothesis given the condition of the source
     growth: float  # of the variance, in a degraded component
     outlier: _Array  # (components,): standard deviation of a fault, rad and m
 
@@ -91,6 +94,7 @@ def plot_law(settings: TrackerSettings, *, polar: bool) -> PlotLaw:
     if p == 0.0:
         faults = range(1)
     pairs = np.array(list(product(range(len(conditions)), faults)))
+    rough = 0.0 if polar or len(conditions) == 1 else _ROUGH  # a radar measures all targets by the same means
     prior = np.array([1.0 - p * (len(faults) - 1), *([p] * (len(faults) - 1))])
     outlier = [np.radians(settings.outlier_azimuth), settings.outlier_range] if polar else [settings.outlier_xy]
     return PlotLaw(
@@ -98,10 +102,21 @@ def plot_law(settings: TrackerSettings, *, polar: bool) -> PlotLaw:
         np.array(conditions),
         pairs[:, 0],
         pairs[:, 1].astype(np.int8),
-        np.log(prior)[pairs[:, 1]],
+        _log_given(np.array(conditions)[pairs[:, 0]], np.array(conditions), rough=rough) + np.log(prior)[pairs[:, 1]],
         settings.degraded_noise**2,
         np.array(outlier),
     )
+
+
+def _log_given(plot: npt.NDArray[np.bool_], source: npt.NDArray[np.bool_], *, rough: float) -> _Array:
+    """Log probability that a plot errs as under each of h conditions, under q conditions of its source, (q, h).
+
+    Component by component: as its source does, but where that is well, with probability `rough` as if it were not.
+    """
+    each = np.array([[1.0 - rough, rough], [0.0, 1.0]])
+    given = each[source[:, None].astype(int), plot.astype(int)].prod(axis=-1)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(given))
 
 
 class History(NamedTuple):
@@ -115,7 +130,10 @@ class SourceCondition:
     """The condition of one source: a forward filter over its scans, fed by all its tracks at once.
 
     Its components degrade independently, each a chain of two states with the given mean stays. One scan multiplies the
-    predicted probability of a condition by the likelihoods of all plots under it.
+    predicted probability of a condition by what all plots say of it. What a single plot says is bounded: with
+    probability e its error is its target's own affair (a poor transmitter, a turn just begun, an error that lasts and
+    was counted before), whatever the source does. So a source is degraded when its tracks err together or one errs for
+    scans with no other to contradict, never for one bad plot.
     """
 
     def __init__(self, law: PlotLaw, settings: TrackerSettings) -> None:
@@ -133,6 +151,11 @@ class SourceCondition:
         """What has been found so far."""
         times = np.array([time for time, _ in self._history])
         return History(times, np.array([p for _, p in self._history]).reshape(-1, len(self.law.degraded)))
+
+    @property
+    def degraded(self) -> bool:
+        """Whether it is probably not well since its last scan."""
+        return bool(np.exp(self._log_probs[0]) < 0.5)
 
     def predicted(self, time: float) -> _Array:
         """Return log probabilities of the conditions at a time, (q,)."""
@@ -153,28 +176,45 @@ class SourceCondition:
 
     def weights(self, prior: _Array) -> _Array:
         """Return log probabilities of all hypotheses, (h,), from those of the conditions."""
-        return np.asarray(prior[self.law.condition] + self.law.log_fault)
+        return np.asarray(logsumexp(prior[:, None] + self.law.log_own, (0,))[0])
 
-    def absorb(self, time: float, prior: _Array, log_f: _Array, known: npt.NDArray[np.bool_]) -> _Array:
+    def absorb(self, time: float, prior: _Array, log_f: _Array, voice: _Array) -> _Array:
         """Take in a scan; return for every plot the log probabilities of its hypotheses before it was seen itself.
 
-        P(q | scan) ~ P(q) prod_i f_i(q), f_i(q) = sum_h P(h) f_i(h); for plot i its own factor is left out, and
-        comes back when its track is conditioned on it.
+        P(q | scan) ~ P(q) prod_i g_i(q)^w_i,  g_i(q) = (1 - e) f_i(q) + e max_q' f_i(q'),
+        f_i(q) = sum_h P(h | q) f_i(h)
+
+        No g_i differs between conditions by more than a factor 1 / e. For plot i its own factor is left out; its f_i
+        comes in when its track is conditioned on it.
 
         Args:
             time: of the scan, s.
             prior: log probabilities of the conditions, (q,).
             log_f: log-likelihood of each plot under each hypothesis, (n, h).
-            known: whether a plot is a confirmed track's, (n,); others say nothing of the source.
+            voice: the exponents w, (n,); see `voice`.
         """
         q, law = len(prior), self.law
-        of_condition = (law.log_fault + log_f).reshape(len(log_f), q, len(law.fault) // q)
-        by_condition = logsumexp(of_condition, (2,))[..., 0]
-        told = np.where(known[:, None], by_condition, 0.0)
+        by_condition = logsumexp(law.log_own + log_f[:, None], (2,))[..., 0]
+        best = by_condition.max(axis=1, keepdims=True)
+        bounded = np.logaddexp(np.log1p(-_OWN_AFFAIR) + by_condition, np.log(_OWN_AFFAIR) + best)
+        told = np.asarray(voice, float)[:, None] * bounded
         total = prior + told.sum(axis=0)
-        if known.any() and q > 1:
+        if np.any(voice) and q > 1:
             self._log_probs = total - logsumexp(total, (0,))
-            self._time = time
-            self._history.append((time, np.exp(self._log_probs)))
+            self._time = max(self._time, time)  # a later round of a slice may hold earlier plots
+            self._history.append((self._time, np.exp(self._log_probs)))
         others = total - told
-        return np.asarray((others - logsumexp(others, (1,)))[:, law.condition] + law.log_fault)
+        others = others - logsumexp(others, (1,))
+        return np.asarray(logsumexp(others[:, :, None] + law.log_own, (1,))[:, 0])
+
+
+def voice(confirmed: npt.NDArray[np.bool_], since: _Array) -> _Array:
+    """How much the plots of tracks may say of their source: w = min(1, since / 4 s), nothing unless confirmed.
+
+    Errors last some seconds, so that of a track seen every half second eight plots say as much as one.
+
+    Args:
+        confirmed: whether each track is, (n,).
+        since: time since its last plot, s.
+    """
+    return np.where(confirmed, np.clip(since / _LASTING, 0.0, 1.0), 0.0)

@@ -72,6 +72,13 @@ class Lifecycle:
         self.has_altitude[rows] = False
         self.icao24[rows] = self.mode3a[rows] = self.named[rows] = NO_CODE
 
+    def renew(self, rows: _Rows) -> None:
+        """Make new tracks of rows begun wrongly: of their last plot alone, and of its time and codes."""
+        self.id[rows] = self._next_id + np.arange(len(rows))
+        self._next_id += len(rows)
+        self.status[rows] = SEED
+        self.history[rows] = 1
+
     def hit(
         self,
         rows: _Rows,

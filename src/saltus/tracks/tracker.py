@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
-from saltus.tracks.faults import SourceCondition, plot_law
+from saltus.tracks.faults import SourceCondition, plot_law, voice
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.kinematics import Moments, Plan, Start, make_kinematics, two_point_start, with_speed_prior
@@ -186,30 +186,34 @@ class Tracker:
         log_f = gated.copies.score(gated.copy, gated.plan, gated.covs)
         chosen = assign(gated.pairs, self._gain(gated, index, logsumexp(source.weights(prior) + log_f, (1,))[:, 0]))
         rows, plots = gated.pairs.track[chosen], index[gated.pairs.plot[chosen]]
-        weights = source.absorb(time, prior, log_f[chosen], life.status[rows] == CONFIRMED)
+        heard = voice(life.status[rows] == CONFIRMED, m.time[plots] - life.time[rows])
+        weights = source.absorb(time, prior, log_f[chosen], heard)
         p = _normalised(weights + log_f[chosen])
         wrong, fault = source.law.faulty(p)
-        new = self._begun(rows, plots, wrong)
+        again = self._twice_wrong(rows, plots, wrong)
+        life.renew(rows[again])
+        self._track_id[life.plot[rows[again]]] = life.id[rows[again]]
+        new = again | (life.status[rows] == SEED)
         self._start(rows[new], plots[new])
         self._update(rows[~new], gated, chosen[~new], weights[~new], p[~new])
         self._enter(rows, plots, period, gated.height_used[chosen], sound=new | (wrong <= 0.5))
         life.p_fault[rows] = np.where(new, np.nan, wrong)
-        # Neither a start nor a fault says whether the filter's innovations are what it thinks.
-        d2 = np.where(new | (p @ (source.law.condition + source.law.fault > 0) > 0.5), np.nan, gated.d2[chosen])
+        # Neither a start nor a fault, nor a degraded source, says whether the filter's innovations are what it thinks.
+        d2 = np.where(new | (wrong > 0.5) | source.degraded, np.nan, gated.d2[chosen])
         self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2, np.where(new, 0, fault))
         left = np.ones(len(index), bool)
         left[gated.pairs.plot[chosen]] = False
         self._begin(index[left], plots[life.status[rows] == CONFIRMED], period)
 
-    def _begun(self, rows: _Index, plots: _Index, wrong: _Array) -> npt.NDArray[np.bool_]:
-        """Say which tracks begin with this plot and the one before.
+    def _twice_wrong(self, rows: _Index, plots: _Index, wrong: _Array) -> npt.NDArray[np.bool_]:
+        """Say which tracks have begun wrongly: tentative ones with two faulty plots in a row.
 
-        They are those of one plot, and tentative ones with two faulty plots in a row: likelier than that is one faulty
-        plot among the two they began with.
+        Likelier than that is one faulty plot among the two they began with. They begin anew, as other tracks, with this
+        plot and the one before.
         """
         life = self._life
         twice = (life.status[rows] == TENTATIVE) & (wrong > 0.5) & (life.p_fault[rows] > 0.5)
-        return np.asarray((life.status[rows] == SEED) | (twice & (self._m.time[plots] > life.time[rows])))
+        return np.asarray(twice & (self._m.time[plots] > life.time[rows]))
 
     def _update(self, rows: _Index, gated: Gated, pairs: _Index, log_weights: _Array, p: _Array) -> None:
         """Condition tracks on the plots chosen, each a mixture of what may be wrong with it.
