@@ -6,8 +6,9 @@ FOLDER holds scenarioN_detections.json and scenarioN_groundTruth.json of the Aut
 scenario is tracked with radar alone, with lidar alone, with all four sensors, and with all of them by a tracker
 without chains of faults; every run is scored at the same epochs of the truth, a missing track counting as 20 m. The
 cameras give bearings alone and cannot be tracked by themselves. Harder cases are made of the same recordings: an
-outage (the lidar silent for a third of the time), and false detections (one detection in ten of radar and lidar moved
-by 20 m to one side or another). Prints one table and writes it as JSON.
+outage (the lidar silent for a third of the time), jamming (in that third errors of 20 m on both axes are added to the
+lidar's, or to the radar's), and false detections (one detection in ten of radar and lidar moved by 20 m to one side or
+another). Prints one table and writes it as JSON.
 """
 
 import argparse
@@ -77,6 +78,14 @@ def scenario(name: str, example: ModuleType, detections: list[dict], truth: pa.T
         ("as it is", _ALL, lambda t: t, False),
         ("lidar silent", _ALL, silent, True),
         ("lidar silent", _ALL, silent, False),
+        ("lidar jammed", ("radar",), lambda t: t, True),
+        ("lidar jammed", ("lidar",), lambda t: jammed(t, "lidar"), True),
+        ("lidar jammed", _ALL, lambda t: jammed(t, "lidar"), True),
+        ("lidar jammed", _ALL, lambda t: jammed(t, "lidar"), False),
+        ("radar jammed", ("radar",), lambda t: jammed(t, "radar"), True),
+        ("radar jammed", ("lidar",), lambda t: t, True),
+        ("radar jammed", _ALL, lambda t: jammed(t, "radar"), True),
+        ("radar jammed", _ALL, lambda t: jammed(t, "radar"), False),
         ("false detections", ("radar",), astray, True),
         ("false detections", ("lidar",), astray, True),
         ("false detections", _ALL, astray, True),
@@ -87,22 +96,36 @@ def scenario(name: str, example: ModuleType, detections: list[dict], truth: pa.T
 
 def silent(table: pa.Table) -> pa.Table:
     """Take the lidar away for the middle third of the time."""
-    time = table["time"].to_numpy()
-    low, high = time.min() + np.ptp(time) * np.array([1 / 3, 2 / 3])
-    return table.filter((np.array(table["source"]) != "lidar") | (time < low) | (time > high))
+    return table.filter((np.array(table["source"]) != "lidar") | ~_middle(table))
+
+
+def jammed(table: pa.Table, source: str) -> pa.Table:
+    """Add large errors to all detections of a sensor in the middle third of the time."""
+    mine = np.flatnonzero((np.array(table["source"]) == source) & _middle(table))
+    return _moved(table, mine, _ASTRAY * np.random.default_rng(3).standard_normal((len(mine), 2)))
 
 
 def astray(table: pa.Table) -> pa.Table:
     """Move some detections of radar and lidar; the same ones whatever else is in the table."""
-    columns = {name: table[name].to_numpy(zero_copy_only=False).copy() for name in ("x_m", "y_m")}
     for source, seed in (("radar", 1), ("lidar", 2)):
         mine = np.flatnonzero(np.array(table["source"]) == source)
         rng = np.random.default_rng(seed)
         moved = mine[rng.uniform(size=len(mine)) < _SHARE]
         angle = rng.uniform(0.0, 2.0 * np.pi, len(moved))
-        columns["x_m"][moved] += _ASTRAY * np.cos(angle)
-        columns["y_m"][moved] += _ASTRAY * np.sin(angle)
-    for name, values in columns.items():
+        table = _moved(table, moved, _ASTRAY * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+    return table
+
+
+def _middle(table: pa.Table) -> np.ndarray:
+    time = table["time"].to_numpy()
+    low, high = time.min() + np.ptp(time) * np.array([1 / 3, 2 / 3])
+    return (time >= low) & (time <= high)
+
+
+def _moved(table: pa.Table, which: np.ndarray, by: np.ndarray) -> pa.Table:
+    for name, step in zip(("x_m", "y_m"), by.T, strict=True):
+        values = table[name].to_numpy(zero_copy_only=False).copy()
+        values[which] += step
         at = table.schema.get_field_index(name)
         table = table.set_column(at, name, pa.array(values, pa.float64(), from_pandas=True))
     return table

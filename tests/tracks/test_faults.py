@@ -11,7 +11,7 @@ from tracking_scenes import SITE, flights, measured, observed, polar_noise, run
 from saltus.errors import ModelError
 from saltus.geo import Plane
 from saltus.simulate import Leg, Radar, Trajectory, observe
-from saltus.tracks.faults import History, SourceCondition, plot_law, voice
+from saltus.tracks.faults import History, SourceCondition, plot_law
 from saltus.tracks.health import degraded_intervals, sensor_health
 from saltus.tracks.settings import TrackerSettings
 
@@ -81,8 +81,7 @@ def test_the_condition_is_that_of_all_sequences(rng, polar):
     law = plot_law(SETTINGS, polar=polar)
     source, times = SourceCondition(law, SETTINGS), [0.0, 7.0, 11.0]
     log_f = rng.normal(-10.0, 3.0, (3, 3, len(law.fault)))
-    heard = voice(np.array([True, True, False]), np.array([9.0, 1.0, 9.0]))
-    np.testing.assert_array_equal(heard, [1.0, 0.25, 0.0])
+    heard = np.array([1.0, 0.25, 0.0])
     rate = 1.0 / np.array(SETTINGS.degraded_sojourn)
     generator = np.array([[-rate[0], rate[0]], [rate[1], -rate[1]]])
     share = rate[0] / rate.sum()
@@ -128,6 +127,17 @@ def test_the_condition_is_that_of_all_sequences(rng, polar):
         np.testing.assert_allclose(
             found / found.sum(axis=1, keepdims=True), expected / expected.sum(axis=1, keepdims=True), rtol=1e-9
         )
+
+
+def test_a_track_is_heard_once_in_four_seconds():
+    source = SourceCondition(plot_law(SETTINGS, polar=True), SETTINGS)
+    confirmed = np.array([True, True, False])
+    first = source.voice(np.array([3, 7, 9]), np.array([10.0, 10.5, 10.0]), confirmed)
+    again = source.voice(np.array([7, 9, 3]), np.array([11.5, 20.0, 16.0]), np.array([True, True, True]))
+    late = source.voice(np.array([3]), np.array([15.0]), np.array([True]))  # a plot that comes late
+    np.testing.assert_array_equal(first, [1.0, 1.0, 0.0])
+    np.testing.assert_array_equal(again, [0.25, 1.0, 1.0])
+    np.testing.assert_array_equal(late, [0.0])
 
 
 def test_tentative_tracks_say_nothing_of_a_source(rng):

@@ -17,7 +17,7 @@ from saltus.linalg import logsumexp
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import TrackerSettings
 
-__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law", "voice"]
+__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -144,6 +144,7 @@ class SourceCondition:
         each = np.where(law.degraded, self._share, 1.0 - self._share)
         self._log_probs = np.log(each.prod(axis=1)) if len(law.degraded) > 1 else np.zeros(1)
         self._time = -np.inf
+        self._heard: dict[int, float] = {}  # when each track was last asked, s
         self._history: list[tuple[float, _Array]] = []
 
     @property
@@ -178,6 +179,21 @@ class SourceCondition:
         """Return log probabilities of all hypotheses, (h,), from those of the conditions."""
         return np.asarray(logsumexp(prior[:, None] + self.law.log_own, (0,))[0])
 
+    def voice(self, track: npt.NDArray[np.int64], time: _Array, confirmed: npt.NDArray[np.bool_]) -> _Array:
+        """Return how much plots may say of the source, (n,): w = min(1, time since the last one so used / 4 s).
+
+        Errors last some seconds, so that of a track seen twice a second eight plots say as much as one.
+
+        Args:
+            track: the track of each plot, no two the same.
+            time: of each plot, s.
+            confirmed: whether the track is; others have no say.
+        """
+        last = np.array([self._heard.get(k, -np.inf) for k in track.tolist()])
+        now = np.maximum(time, last)
+        self._heard.update(zip(track[confirmed].tolist(), now[confirmed].tolist(), strict=True))
+        return np.where(confirmed, np.clip((time - last) / _LASTING, 0.0, 1.0), 0.0)
+
     def absorb(self, time: float, prior: _Array, log_f: _Array, voice: _Array) -> _Array:
         """Take in a scan; return for every plot the log probabilities of its hypotheses before it was seen itself.
 
@@ -191,7 +207,7 @@ class SourceCondition:
             time: of the scan, s.
             prior: log probabilities of the conditions, (q,).
             log_f: log-likelihood of each plot under each hypothesis, (n, h).
-            voice: the exponents w, (n,); see `voice`.
+            voice: the exponents w, (n,), of `voice`.
         """
         q, law = len(prior), self.law
         by_condition = logsumexp(law.log_own + log_f[:, None], (2,))[..., 0]
@@ -206,15 +222,3 @@ class SourceCondition:
         others = total - told
         others = others - logsumexp(others, (1,))
         return np.asarray(logsumexp(others[:, :, None] + law.log_own, (1,))[:, 0])
-
-
-def voice(confirmed: npt.NDArray[np.bool_], since: _Array) -> _Array:
-    """How much the plots of tracks may say of their source: w = min(1, since / 4 s), nothing unless confirmed.
-
-    Errors last some seconds, so that of a track seen every half second eight plots say as much as one.
-
-    Args:
-        confirmed: whether each track is, (n,).
-        since: time since its last plot, s.
-    """
-    return np.where(confirmed, np.clip(since / _LASTING, 0.0, 1.0), 0.0)

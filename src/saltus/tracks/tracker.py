@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
-from saltus.tracks.faults import SourceCondition, plot_law, voice
+from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.kinematics import Moments, Plan, Start, make_kinematics, two_point_start, with_speed_prior
@@ -186,8 +186,8 @@ class Tracker:
         log_f = gated.copies.score(gated.copy, gated.plan, gated.covs)
         chosen = assign(gated.pairs, self._gain(gated, index, logsumexp(source.weights(prior) + log_f, (1,))[:, 0]))
         rows, plots = gated.pairs.track[chosen], index[gated.pairs.plot[chosen]]
-        heard = voice(life.status[rows] == CONFIRMED, m.time[plots] - life.time[rows])
-        weights = source.absorb(time, prior, log_f[chosen], heard)
+        voice = source.voice(life.id[rows], m.time[plots], life.status[rows] == CONFIRMED)
+        weights = source.absorb(time, prior, log_f[chosen], voice)
         p = _normalised(weights + log_f[chosen])
         wrong, fault = source.law.faulty(p)
         again = self._twice_wrong(rows, plots, wrong)
