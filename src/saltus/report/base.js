@@ -11,7 +11,8 @@ function decode(column) {
   return new ARRAYS[column.type](bytes.buffer);
 }
 
-for (const part of [D.plots, D.updates, D.gates])
+const S = D.systems; // undefined with one system
+for (const part of [D.plots, D.updates, D.gates, ...(S ? [S.members, S.pairs] : [])])
   for (const name in part) if (part[name] && part[name].b64 !== undefined) part[name] = decode(part[name]);
 
 const P = D.plots, U = D.updates, G = D.gates, TRACKS = D.tracks;

@@ -4,12 +4,15 @@ import numpy as np
 import numpy.typing as npt
 from jaxtyping import Float
 
-__all__ = ["HEIGHT_ENDS", "PROBABILITY_ENDS", "colour_map", "oklab_to_srgb", "srgb_to_oklab"]
+__all__ = ["HEIGHT_ENDS", "PROBABILITY_ENDS", "colour_map", "oklab_to_srgb", "srgb_to_oklab", "system_colours"]
 
 # (lightness, chroma, hue in degrees) of both ends. Lightness falls along each map, so it survives grey printing and
 # every colour vision; on white paper a straight flight stays quiet and a manoeuvre stands out.
 PROBABILITY_ENDS = ((0.76, 0.055, 245.0), (0.42, 0.175, 15.0))
 HEIGHT_ENDS = ((0.80, 0.095, 165.0), (0.36, 0.115, 275.0))
+
+# Dark enough for white figures on them; always shown with the number of the system, as eight hues are too many.
+_SYSTEMS = ("#24476b", "#b35900", "#0b7d7a", "#a8123f", "#6b4f9e", "#5f6b1f", "#7c5138", "#3b78b5")
 
 _LMS_FROM_RGB = np.array(
     [
@@ -53,3 +56,8 @@ def colour_map(
     a, b = (np.array([L, C * np.cos(np.radians(h)), C * np.sin(np.radians(h))]) for L, C, h in ends)
     rgb = oklab_to_srgb(a + np.linspace(0.0, 1.0, n)[:, None] * (b - a))
     return ["#" + "".join(f"{round(255 * v):02x}" for v in row) for row in rgb]
+
+
+def system_colours(n: int) -> list[str]:
+    """Return a colour for each of `n` systems; they come again after eight."""
+    return [_SYSTEMS[k % len(_SYSTEMS)] for k in range(n)]

@@ -23,7 +23,8 @@ function fillSide() {
   });
   const facts = element("dl", { class: "facts" }, fact("Start", clock(U.t[track.first])), fact("Duration", lasting(track.duration)),
     fact("Updates", grouped(track.n)), fact("In manoeuvre", lasting(track.man)));
-  side.replaceChildren(element("header", {}, element("b", {}, track.title), element("span", {}, track.text), pin), facts, element("div", { class: "plot" }, sidePlot));
+  const made = S ? [element("p", { class: "legend" }, ...systemsOf(state.selected).map((k) => element("span", {}, chip(k), " " + S.names[k])))] : [];
+  side.replaceChildren(element("header", {}, element("b", {}, track.title), element("span", {}, track.text), pin), facts, ...made, element("div", { class: "plot" }, sidePlot));
 }
 
 let cards = [];
@@ -63,15 +64,17 @@ const list = document.getElementById("list");
 function select(k) {
   state.selected = k;
   fillSide();
+  if (S) fillMembers();
   if (list) for (const row of list.tBodies[0].rows) row.classList.toggle("current", +row.dataset.track === k);
   repaint();
 }
 
-if (list) {
-  list.tBodies[0].addEventListener("click", (event) => {
-    const row = event.target.closest("tr");
+for (const table of document.querySelectorAll("#list, .pick"))
+  table.tBodies[0].addEventListener("click", (event) => {
+    const row = event.target.closest("tr[data-track]");
     if (row) select(+row.dataset.track);
   });
+if (list) {
   list.tHead.addEventListener("click", (event) => {
     const head = event.target.closest("th");
     if (!head) return;

@@ -14,7 +14,9 @@ from saltus.io.write import output_file
 from saltus.records import Plots
 from saltus.report.colours import HEIGHT_ENDS, PROBABILITY_ENDS, colour_map
 from saltus.report.data import payload, time_span
+from saltus.report.section import systems_section
 from saltus.report.sensors import HEIGHT, WIDTH, sensor_rows
+from saltus.report.systems import SystemsFound
 from saltus.report.tables import Block, blocks, innovation_rows, reason_rows, show, title
 from saltus.report.updates import Updates, groups, read_updates
 
@@ -28,8 +30,9 @@ if TYPE_CHECKING:
 __all__ = ["write_report"]
 
 MAX_ROWS = 2000  # tracks listed in the table
-_SCRIPTS = ("base.js", "plan.js", "pointer.js", "timeline.js", "panels.js", "main.js")
-_PLACED = ("faults", "inputs", "noise", "problems", "version")  # keys of the summary with a place of their own
+_SCRIPTS = ("base.js", "plan.js", "pointer.js", "timeline.js", "panels.js", "systems.js", "main.js")
+# Keys of the summary with a place of their own.
+_PLACED = ("faults", "inputs", "noise", "problems", "systems", "version")
 
 
 def write_report(
@@ -42,6 +45,7 @@ def write_report(
     summary: Mapping[str, object],
     sites: Mapping[str, "Site"],
     sensors: Sequence["Health"] = (),
+    systems: SystemsFound | None = None,
 ) -> None:
     """Write one self-contained HTML page; it needs no network and appears whole or not at all.
 
@@ -56,6 +60,7 @@ def write_report(
             their own places; every other key is laid out as it comes.
         sites: sensors' places by designation (`CAT048:20/129`) or name.
         sensors: faults of each sensor, for its timeline.
+        systems: who is whom among several systems; None where there is one.
 
     Raises:
         DataError: `path` is a directory.
@@ -68,13 +73,19 @@ def write_report(
         "colours": {"p": colour_map(PROBABILITY_ENDS), "height": colour_map(HEIGHT_ENDS)},
         "groups": {"manoeuvring": jumping, "busiest": busiest},
     }
+    index = {row.id: k for k, row in enumerate(updates.rows)}
+    span = time_span(plots, updates)
+    section, linked = systems_section(systems, index, span)
+    drawn |= linked
     page = _template().render(
         **_assets(),
         data=_script_json(drawn),
         ramp=drawn["colours"],
         notes=notes,
-        sensors=sensor_rows(sensors, time_span(plots, updates)),
+        sensors=sensor_rows(sensors, span),
         panel=(WIDTH, HEIGHT),
+        found=section,
+        index=index,
         **_header(plots, assignments, updates, summary),
         **_tables(updates, assignments, innovations, summary),
     )
@@ -153,7 +164,6 @@ def _tables(
         "innovations": innovation_rows(innovations),
         "rows": confirmed[:MAX_ROWS],
         "n_confirmed": len(confirmed),
-        "index": {row.id: k for k, row in enumerate(updates.rows)},
         "problems": [problems] if isinstance(problems, str) else [show(p) for p in _listed(problems)],
         "run": run,
         "title": title,

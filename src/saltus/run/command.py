@@ -20,7 +20,13 @@ from saltus.geo import Site
 from saltus.io.write import output_directory
 from saltus.progress import Progress, progress_bar
 from saltus.records import REASONS, Kind, Plots, Recording, Source
-from saltus.run.identified import bias_tables, conflict_lines, identification_summary, identification_table
+from saltus.run.identified import (
+    bias_tables,
+    conflict_lines,
+    identification_summary,
+    identification_table,
+    systems_found,
+)
 from saltus.run.pipeline import Identified, track_plots
 from saltus.summary import Sensors, Tracked, health_of, noise_rows, show_summary, summarise
 from saltus.tracks.output import assignment_table, innovation_table, track_table
@@ -86,6 +92,7 @@ def track_files(
         if report:
             from saltus.report import write_report
 
+            titles = {str(s.system): name for s, name in zip(plots.sources, sensors.names, strict=True)}
             sites = {str(s.system): site for s, site in zip(plots.sources, sensors.sites, strict=True) if site}
             write_report(
                 folder / "report.html",
@@ -96,6 +103,7 @@ def track_files(
                 summary={**summary, "noise": noise_rows(summary)},
                 sites=sites,
                 sensors=health_of(sensors, tracked),
+                systems=systems_found(whole, config.systems, titles),
             )
     show_summary(summary, output, report)
     return summary

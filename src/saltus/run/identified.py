@@ -1,25 +1,24 @@
-"""What a run found of identity and biases, as tables and lines: identifications.parquet, biases.json."""
+"""What a run found of identity and biases, as tables and lines: identifications.parquet, biases.json, the report."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from saltus.report.systems import CONFLICTS, SystemsFound
 from saltus.run.pipeline import Identified
 from saltus.tracks.bias import PARAMETERS
+from saltus.tracks.identities import decision_rule
+from saltus.tracks.membership import Segments
+from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.systems import Registered
 
-__all__ = ["bias_tables", "conflict_lines", "identification_summary", "identification_table"]
+__all__ = ["bias_tables", "conflict_lines", "identification_summary", "identification_table", "systems_found"]
 
 _LASTING = 20.0  # s: a conflict shorter than this is no line for the user
 _MOST_LINES = 8
-_KINDS = {
-    "rival": "both claim one track",
-    "addresses": "are one object by their positions and two by their addresses",
-    "places": "have one address at two places",
-    "inconsistent": "are one object by themselves, but not with the others of their group",
-}
 
 
 def identification_table(whole: Identified) -> pa.Table:
@@ -127,9 +126,28 @@ def conflict_lines(whole: Identified) -> list[str]:
     found = [c for c in whole.decisions.conflicts if c.time_to - c.time_from >= _LASTING]
     found.sort(key=lambda c: c.time_from - c.time_to)
     lines = [
-        f"identity conflict: {named(c.a)} and {named(c.b)} {_KINDS[c.kind]}, for {c.time_to - c.time_from:.0f} s."
+        f"identity conflict: {named(c.a)} and {named(c.b)} {CONFLICTS[c.kind]}, for {c.time_to - c.time_from:.0f} s."
         for c in found[:_MOST_LINES]
     ]
     if len(found) > _MOST_LINES:
         lines.append(f"{len(found) - _MOST_LINES} more identity conflicts: see the report.")
     return lines
+
+
+def systems_found(whole: Identified, settings: SystemsSettings, titles: Mapping[str, str]) -> SystemsFound | None:
+    """Return what the report shows of several systems, None of one; `titles` are the sources' names as configured."""
+    if len(whole.systems) < 2:
+        return None
+    published = np.isin(whole.segments.system_track, _with_own(whole))
+    return SystemsFound(
+        names=tuple(x.name for x in whole.systems),
+        titles=tuple(titles.get(x.name, x.name) for x in whole.systems),
+        system=np.repeat(np.arange(len(whole.systems)), [len(x.ids) for x in whole.systems]),
+        local_id=tuple(label for x in whole.systems for label in x.local_id),
+        address=np.concatenate([x.view.icao24 for x in whole.systems]),
+        segments=Segments(*(column[published] for column in whole.segments)),
+        decisions=whole.decisions,
+        evidence=whole.evidence,
+        rule=decision_rule(whole.systems, settings),
+        biases=bias_tables(whole),
+    )

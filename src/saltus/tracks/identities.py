@@ -24,7 +24,7 @@ from saltus.tracks.local import LocalSystem
 from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.systems import Registered, lasting_difference, pairing_settings, short_difference
 
-__all__ = ["identify"]
+__all__ = ["decision_rule", "identify"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
@@ -67,13 +67,17 @@ def identify(
     evidence = join_evidence(parts)
     number = np.repeat(np.arange(len(systems)), np.diff(first))
     address = np.concatenate([s.view.icao24 for s in systems])
-    rule = DecisionSettings(
+    return decide_pairs(evidence, number, decision_rule(systems, settings), address=address), evidence
+
+
+def decision_rule(systems: Sequence[LocalSystem], settings: SystemsSettings) -> DecisionSettings:
+    """Return when tracks are declared one object: any track that a system has at a time could be the one."""
+    return DecisionSettings(
         prior=1.0 / _at_once(systems),
         p_false=settings.p_false,
         p_false_split=settings.p_false_split,
         hysteresis=settings.hysteresis,
     )
-    return decide_pairs(evidence, number, rule, address=address), evidence
 
 
 def _interval(tracks: LocalTracks) -> float:
