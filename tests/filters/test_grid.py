@@ -197,7 +197,7 @@ def test_runs_do_not_depend_on_each_other(cases):
 def test_what_a_grid_cannot_do_is_refused():
     model, sensor = case("b")
     z, times = np.zeros((2, 1)), [0.2, 0.4]
-    with pytest.raises(ModelError, match="cells must be at least 8"):
+    with pytest.raises(ModelError, match="at least 8 on each of 1 axes, got 4"):
         GridFilter(4).run(model, sensor, z, times)
     with pytest.raises(ModelError, match="low < high"):
         GridFilter(bounds=(1.0, -1.0)).run(model, sensor, z, times)

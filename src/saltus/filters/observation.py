@@ -11,7 +11,7 @@ from saltus.errors import DataError, ModelError
 from saltus.linalg import gaussian_terms
 from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE, as_diffusion
 
-__all__ = ["Observation", "innovation_nis", "observation"]
+__all__ = ["Observation", "elapsed", "innovation_nis", "measured", "observation"]
 
 
 class Observation(NamedTuple):
@@ -47,21 +47,50 @@ def observation(
         if isinstance(sensor, DiffusionSensor):
             raise ModelError("a hybrid model has its own sensors: give a name, or None for all, stacked.")
         model, sensor = as_diffusion(model, sensor)
+    if not isinstance(model, SwitchingSDE):
+        raise ModelError(f"the model must be a SwitchingSDE or a HybridModel, got {type(model).__name__}.")
     if not isinstance(sensor, DiffusionSensor):
         raise ModelError(f"a switching diffusion needs a DiffusionSensor, got {type(sensor).__name__}.")
     m = sensor.check(model.means0)
-    seen, t = np.asarray(z, dtype=np.float64), np.asarray(times, dtype=np.float64)
+    seen, t = measured(z, "z"), measured(times, "times")
     if seen.ndim < 2 or t.shape != seen.shape[-2:-1] or seen.shape[-1] != m or not len(t):
         raise DataError(f"z must be (..., T, {m}) for T times (T,), T >= 1; got z {seen.shape} and times {t.shape}.")
+    if not seen.size:
+        raise DataError(f"z holds no run: its shape is {seen.shape}.")
     if np.isinf(seen).any():
         raise DataError(f"z holds infinity at {np.argwhere(np.isinf(seen))[0].tolist()}; a missing component is NaN.")
-    dts = np.diff(t, prepend=t0)
-    if not np.isfinite(dts).all() or dts.min() < 0:
+    dts = elapsed(t, t0)
+    return Observation(model, sensor, seen.reshape(-1, *seen.shape[-2:]), dts, t, seen.shape[:-2])
+
+
+def measured(value: npt.ArrayLike, what: str) -> Float[np.ndarray, "..."]:
+    """Read an array of numbers.
+
+    Raises:
+        DataError: it is ragged, or not of numbers.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{what} must be an array of numbers, with NaN for what is missing: {error}.") from None
+
+
+def elapsed(times: Float[np.ndarray, " t"], t0: float) -> Float[np.ndarray, " t"]:
+    """Intervals before each of the times, the first from t0.
+
+    Raises:
+        DataError: times decrease, precede t0, or are not finite.
+    """
+    dts = np.diff(times, prepend=t0)
+    if not np.isfinite(dts).all():
+        row = int(np.argmin(np.isfinite(times)))
+        raise DataError(f"times must be finite: t0 is {t0:g} s, row {row} has {times[row]:g} s. Leave such rows out.")
+    if dts.min() < 0:
         raise DataError(
             f"times must not decrease, nor precede t0 = {t0:g} s: row {int(dts.argmin())} comes "
             f"{-dts.min():g} s too early. Sort by time, or say when the prior holds: t0=."
         )
-    return Observation(model, sensor, seen.reshape(-1, *seen.shape[-2:]), dts, t, seen.shape[:-2])
+    return dts
 
 
 def innovation_nis(

@@ -12,7 +12,7 @@ from saltus.filters.align import align
 from saltus.filters.bootstrap import Moves, bootstrap, diffusion_moves, hybrid_moves
 from saltus.filters.estimates import Estimates
 from saltus.filters.flat import flatten
-from saltus.filters.observation import observation
+from saltus.filters.observation import elapsed, measured, observation
 from saltus.filters.particles import generator
 from saltus.filters.rao_blackwell import check_groups, particle_filter
 from saltus.filters.run import Record, in_order
@@ -87,8 +87,7 @@ class ParticleFilter:
             names = list(model.sensors) if sensor is None else [sensor] if isinstance(sensor, str) else sensor
             if isinstance(names, DiffusionSensor):
                 raise ModelError("a hybrid model has its own sensors: give a name, or None for all, stacked.")
-            seen, t = np.asarray(z, np.float64), np.asarray(times, np.float64)
-            return self._hybrid(model, list(names), seen, t, t0, source)
+            return self._hybrid(model, list(names), measured(z, "z"), measured(times, "times"), t0, source)
         given = observation(model, sensor, z, times, t0)
         found = self._drawn(
             diffusion_moves(given.model, given.dts, self.substeps), given.sensor, given.z, given.dts, source
@@ -100,9 +99,7 @@ class ParticleFilter:
     ) -> Estimates:
         if times.ndim != 1 or z.ndim < 2 or z.shape[-2] != len(times):
             raise DataError(f"z must be (..., T, m) for T times (T,); got z {z.shape} and times {times.shape}.")
-        dts = np.diff(times, prepend=t0)
-        if not np.isfinite(dts).all() or dts.min() < 0:
-            raise DataError(f"times must not decrease, nor precede t0 = {t0:g} s: row {int(np.argmin(dts))} does.")
+        dts = elapsed(times, t0)
         chains = tuple(chain.name for chain in model.chains)
         if all(isinstance(model.sensors.get(name), LinearSensor | None) for name in names):
             arrays = model.compile(dt=dts, sensor=names)._asdict()

@@ -162,8 +162,10 @@ def generator(rng: np.random.Generator | None) -> np.random.Generator:
     """Return the source of randomness.
 
     Raises:
-        ModelError: there is none.
+        ModelError: there is none, or it is something else.
     """
     if rng is None:
         raise ModelError("a particle filter draws: pass rng=np.random.default_rng(seed).")
+    if not isinstance(rng, np.random.Generator):
+        raise ModelError(f"rng must be a generator, got {rng!r}: pass rng=np.random.default_rng(seed).")
     return rng

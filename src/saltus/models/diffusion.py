@@ -17,6 +17,13 @@ from saltus.models.checks import FloatArray, covariance, numbers, same
 
 __all__ = ["Field", "SwitchingSDE", "field_value", "probe_states"]
 
+_MEND = (  # by the number of axes at one state
+    "A rate is one number at each state: write it of components, as y[..., 0].",
+    "Write y[..., 0] for the first component, and np.stack([...], axis=-1) for several results; a constant is (n,).",
+    "A matrix has one row per component: a number stands for that number times the unit matrix, a function of one "
+    "component and one noise returns b[..., None].",
+)
+
 # A function of states (..., n) with any leading axes, or a constant.
 Field: TypeAlias = Callable[[FloatArray], npt.ArrayLike] | npt.ArrayLike
 
@@ -58,14 +65,16 @@ class SwitchingSDE:
         put = object.__setattr__
         put(self, "probs0", _law(self.probs0))
         put(self, "mean0", numbers(self.mean0, "mean0"))
+        if np.ndim(self.mean0) == 0:
+            raise ModelError(f"mean0 must be (n,), or (S, n) per mode, got {self.mean0}. Write [{self.mean0}].")
         put(self, "cov0", covariance(self.cov0, "cov0"))
         n_modes, n = self.n_modes, self.n_state
         _prior_fits("mean0", np.shape(self.mean0), n_modes, (n,))
         _prior_fits("cov0", np.shape(self.cov0), n_modes, (n, n))
         put(self, "drift", _fixed(self.drift, "drift", n_modes))
         put(self, "diffusion", _fixed(self.diffusion, "diffusion", n_modes))
-        put(self, "intensity", dict(self.intensity))
-        put(self, "restore", _restored(self.restore or {}, n_modes, n))
+        put(self, "intensity", _rates(self.intensity, n_modes))
+        put(self, "restore", _restored(self.restore or {}, self.intensity, n))
         self._probe()
 
     def __eq__(self, other: object) -> bool:
@@ -113,8 +122,21 @@ class SwitchingSDE:
         return np.asarray(b @ b.swapaxes(-1, -2))
 
     def rate(self, switch: tuple[int, int], x: Float[np.ndarray, "*lead n"]) -> Float[np.ndarray, "*lead"]:
-        """Rate of a switch (from, to) at states (..., n), 1/s; 0 for one that never happens."""
-        return field_value(self.intensity.get(switch, 0.0), x, (), f"intensity[{switch}]")
+        """Rate of a switch (from, to) at states (..., n), 1/s; 0 for one that never happens.
+
+        Raises:
+            ModelError: the rate is negative somewhere.
+        """
+        rates = field_value(self.intensity.get(switch, 0.0), x, (), f"intensity[{switch}]")
+        if rates.size and rates.min() < 0:
+            at = np.reshape(x, (-1, self.n_state))[int(rates.argmin())]
+            raise ModelError(
+                f"intensity[{switch}] is {rates.min():g} per second at state {at}: rates must not be negative, "
+                "wherever a filter may look.\n"
+                "Give rates per second by (from, to), np.maximum(rate, 0.0) if need be; the exit rate is their sum and "
+                "needs no entry."
+            )
+        return rates
 
     def exit_rate(self, mode: int, x: Float[np.ndarray, "*lead n"]) -> Float[np.ndarray, "*lead"]:
         """Rate at which a mode is left, 1/s."""
@@ -136,14 +158,7 @@ class SwitchingSDE:
             self.drift_at(mode, x)
             self.diffusion_at(mode, x)
         for switch in self.switches:
-            _pair(switch, self.n_modes, "intensity")
-            rates = self.rate(switch, x)
-            if rates.min() < 0:
-                at = x.reshape(-1, self.n_state)[int(rates.argmin())]
-                raise ModelError(
-                    f"intensity[{switch}] is {rates.min():g} per second at state {at}: rates must not be negative.\n"
-                    "Give rates per second by (from, to); the exit rate is their sum and needs no entry."
-                )
+            self.rate(switch, x)
 
 
 def probe_states(means: Float[np.ndarray, "s n"], covs: Float[np.ndarray, "s n n"]) -> Float[np.ndarray, "s p n"]:
@@ -160,37 +175,49 @@ def field_value(
     """Value of a function or constant at states (..., n), of shape (..., *core); None in core leaves a size open.
 
     Raises:
-        ModelError: another shape, or numbers that are not finite.
+        ModelError: another shape, numbers that are not finite, or a function that fails.
     """
     lead = np.shape(x)[:-1]
     if not callable(field):
         array = np.asarray(field)
         if array.ndim == 0 and len(core) == 2:
             array = array * np.eye(np.shape(x)[-1])
-        _core_fits(array.shape, core, what, "Constants have no leading axes.")
+        _core_fits(array.shape, core, what)
         return np.broadcast_to(array, (*lead, *array.shape))
-    array = np.asarray(field(x), dtype=np.float64)
+    try:
+        array = np.asarray(field(x), dtype=np.float64)
+    except (IndexError, TypeError, ValueError) as error:
+        raise ModelError(
+            f"{what} failed for states {np.shape(x)}: {error}\n"
+            "It is called with many states at once: write y[..., 0] for the first component, np.where for branches."
+        ) from error
     split = array.ndim - len(core)
     if array.shape[: max(split, 0)] != lead:
         wanted = (*lead, *("w" if size is None else size for size in core))
         raise ModelError(
-            f"{what} returned shape {array.shape} for states {np.shape(x)}; it must keep leading axes: {wanted}.\n"
-            "Write y[..., 0] for the first component, and np.stack([...], axis=-1) for several results."
+            f"{what} returned shape {array.shape} for states {np.shape(x)}; it must keep leading axes: "
+            f"{_shown(wanted)}.\n{_MEND[len(core)]}"
         )
-    _core_fits(array.shape[split:], core, what, "")
+    _core_fits(array.shape[split:], core, what)
     if not np.isfinite(array).all():
         bad = np.argwhere(~np.isfinite(array))[0][: len(lead)]
         raise ModelError(f"{what} is not finite at state {x[tuple(bad)]}; it must be defined on the whole space.")
     return array
 
 
-def _core_fits(shape: tuple[int, ...], core: tuple[int | None, ...], what: str, hint: str) -> None:
+def _core_fits(shape: tuple[int, ...], core: tuple[int | None, ...], what: str) -> None:
     if len(shape) != len(core) or any(want not in (None, have) for have, want in zip(shape, core, strict=True)):
         wanted = tuple("w" if size is None else size for size in core)
-        raise ModelError(f"{what} has shape {shape}, but must have {wanted} at one state. {hint}".rstrip())
+        raise ModelError(f"{what} has shape {shape}, but must have {_shown(wanted)} at one state.\n{_MEND[len(core)]}")
+
+
+def _shown(shape: tuple[int | str, ...]) -> str:
+    return f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
 
 
 def _fixed(fields: Sequence[Field], what: str, n_modes: int) -> tuple[Field, ...]:
+    if callable(fields) or np.ndim(np.asarray(fields, dtype=object)) == 0:
+        raise ModelError(f"{what} must be a list with one entry per mode, got {fields!r}. Write [{what}] for one mode.")
     if len(fields) != n_modes:
         raise ModelError(f"{what} has {len(fields)} entries, but probs0 has {n_modes} modes; give one per mode.")
     return tuple(f if callable(f) else numbers(f, f"{what}[{i}]") for i, f in enumerate(fields))
@@ -208,14 +235,27 @@ def _prior_fits(what: str, shape: tuple[int, ...], n_modes: int, core: tuple[int
         raise ModelError(f"{what} must have shape {core}, or {(n_modes, *core)} per mode, got {shape}.")
 
 
+def _rates(given: Mapping[tuple[int, int], Field], n_modes: int) -> dict[tuple[int, int], Field]:
+    if not isinstance(given, Mapping):
+        raise ModelError(f"intensity must be a dictionary of rates by (from, to), as {{(0, 1): 0.3}}, got {given!r}.")
+    for switch in given:
+        _pair(switch, n_modes, "intensity")
+    return {s: f if callable(f) else numbers(f, f"intensity[{s}]") for s, f in given.items()}
+
+
 def _restored(
-    given: Mapping[tuple[int, int], tuple[object, object] | None], n_modes: int, n: int
+    given: Mapping[tuple[int, int], tuple[object, object] | None], rates: Mapping[tuple[int, int], Field], n: int
 ) -> dict[tuple[int, int], tuple[FloatArray, FloatArray]]:
+    if not isinstance(given, Mapping):
+        raise ModelError(f"restore must be a dictionary of (mean, cov) by (from, to), got {given!r}.")
     laws = {}
     for switch, law in given.items():
-        _pair(switch, n_modes, "restore")
+        if switch not in rates:
+            raise ModelError(f"restore has {switch!r}, a switch without intensity. Those with one: {[*rates]}.")
         if law is None:
             continue
+        if not isinstance(law, tuple | list) or len(law) != 2:
+            raise ModelError(f"restore[{switch}] must be (mean, cov), or None where the state is kept, got {law!r}.")
         mean, cov = numbers(law[0], f"restore[{switch}] mean"), covariance(law[1], f"restore[{switch}] cov")
         if mean.shape != (n,) or cov.shape != (n, n):
             raise ModelError(f"restore[{switch}] must be a mean ({n},) and a covariance ({n}, {n}).")

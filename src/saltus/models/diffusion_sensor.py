@@ -46,6 +46,10 @@ class DiffusionSensor:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
+        for what, given in (("h", self.h), ("R", self.R), ("angular", self.angular)):
+            if given is not None and (callable(given) or np.ndim(np.asarray(given, dtype=object)) == 0):
+                entries = "component" if what == "angular" else "mode"
+                raise ModelError(f"{what} must be a list with one entry per {entries}, got {given!r}. Write [{what}].")
         if len(self.h) != len(self.R) or not len(self.h):
             raise ModelError(f"a sensor needs one h and one R per mode: got {len(self.h)} and {len(self.R)}.")
         h = [f if callable(f) else np.atleast_1d(numbers(f, f"h[{i}]")) for i, f in enumerate(self.h)]

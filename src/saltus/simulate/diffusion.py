@@ -61,7 +61,7 @@ def simulate_diffusion(
     """
     t = np.asarray(times, dtype=np.float64)
     dts = np.diff(t, prepend=t0)
-    if t.ndim != 1 or not len(t) or dts.min() < 0 or substeps < 1:
+    if t.ndim != 1 or not len(t) or not dts.min() >= 0 or substeps < 1:
         raise ModelError(f"need times (T,) that increase from t0 = {t0:g} s, and substeps >= 1: {t[:5]}, {substeps}.")
     m, n = sensor.check(model.means0), model.n_state
     noise = _drawn(model, (len(t), substeps), m, rng, batch)
@@ -127,6 +127,8 @@ def _drawn(
 
     if isinstance(rng, np.random.Generator):
         return draw(rng, batch)
+    if not isinstance(rng, Sequence) or not all(isinstance(source, np.random.Generator) for source in rng):
+        raise ModelError(f"rng must be one generator or a list of them, got {rng!r}: np.random.default_rng(seed).")
     return _Noise(*(np.concatenate(parts) for parts in zip(*(draw(source, 1) for source in rng), strict=True)))
 
 

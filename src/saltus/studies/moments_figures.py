@@ -70,11 +70,14 @@ def _densities(path: Path, outcomes: dict[str, Outcome]) -> None:
             y, true = found.axes[0], found.density[0, 0].sum(axis=0)
             axes.fill_between(y, true, color=LIGHT, lw=0)
             axes.plot(y, true, color=INK, lw=2.2, label="grid: the posterior itself")
+            highest = true.max()
             for label, colour, words in _CURVES:
-                axes.plot(y, _closure(outcome, label, run, step, y[:, None]), color=colour, lw=1.3, label=words)
+                density = _closure(outcome, label, run, step, y[:, None])
+                axes.plot(y, density, color=colour, lw=1.3, label=words)
+                highest = max(highest, density.max())
             seen = y[true > 1e-3 * true.max()]
             axes.set_xlim(seen[0] - 0.4, seen[-1] + 0.4)
-            axes.set_ylim(0, 1.25 * true.max())
+            axes.set_ylim(0, min(1.08 * highest, 2.2 * true.max()))
             axes.set_title(_TITLES[name])
             axes.set_xlabel("state")
         for axes in panels[:, 0]:
@@ -124,9 +127,9 @@ def _trajectory(path: Path, outcome: Outcome) -> None:
         top.plot(t, outcome.draws.states[run, :, 0], color=INK, lw=2.2, label="truth")
         top.plot(t, mean, color=BLUE, lw=1.5, label="maximum entropy 4")
         top.set_ylabel("state")
-        low.plot(t, outcome.reference.probs[run, :, 1], color=INK, lw=2.6, label="grid")
+        low.plot(t, outcome.reference.probs[run, :, 1], color=GREY, lw=4.5, alpha=0.6, label="grid")
         low.plot(t, two.probs[0, :, 1], color=ORANGE, lw=1.3, label="order 2")
-        low.plot(t, four.probs[0, :, 1], color=BLUE, lw=1.3)
+        low.plot(t, four.probs[0, :, 1], color=BLUE, lw=1.5)
         low.set_ylim(0, 1)
         low.set_ylabel("P(linear mode)")
         low.set_xlabel("time, s")
@@ -149,19 +152,22 @@ def _plane(path: Path, outcome: Outcome) -> None:
         (words, _closure(outcome, name, run, step, x.reshape(-1, 2)).reshape(true.shape)) for name, _, words in _CURVES
     ]
     levels = true.max() * np.array([0.02, 0.1, 0.3, 0.6, 0.9])
-    inside = [np.flatnonzero(true.max(axis=1 - axis) > 0.005 * true.max()) for axis in range(2)]
-    with new_figure(7.4, "Range and bearing (c): contours of the posterior") as figure:
+    highest = np.max([true, *(density for _, density in each)], axis=0)  # of all panels: no contour is cut off
+    inside = [np.flatnonzero(highest.max(axis=1 - axis) > levels[0]) for axis in range(2)]
+    with new_figure(7.4, "Range and bearing (c): contours of the posterior, and the truth (+)") as figure:
         panels = figure.subplots(2, 2, sharex=True, sharey=True)
         for axes, (words, density) in zip(panels.flat, [("grid: the posterior itself", true), *each], strict=True):
             _contours(axes, found.axes, true, density, levels)
             axes.plot(*outcome.draws.states[run, step], "+", color=ORANGE, ms=11, mew=2)
             axes.set_title(words)
-        panels[0, 0].set_xlim(found.axes[0][inside[0][0]], found.axes[0][inside[0][-1]])
-        panels[0, 0].set_ylim(found.axes[1][inside[1][0]], found.axes[1][inside[1][-1]])
+        for set_limits, line, cells in zip(
+            (panels[0, 0].set_xlim, panels[0, 0].set_ylim), found.axes, inside, strict=True
+        ):
+            set_limits(line[max(cells[0] - 2, 0)], line[min(cells[-1] + 2, len(line) - 1)])
         for axes in panels[:, 0]:
             axes.set_ylabel("second coordinate")
         for axes in panels[1]:
-            axes.set_xlabel("first coordinate (+ truth)")
+            axes.set_xlabel("first coordinate")
         save(figure, path)
 
 

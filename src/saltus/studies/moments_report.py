@@ -9,7 +9,6 @@ from saltus.studies.moments_figures import draw_moments
 __all__ = ["moments_metrics", "moments_study"]
 
 _RUNS = 60
-_PLANE_SHARE = 2  # the grid in the plane is dear: half as many runs
 
 
 def moments_study(
@@ -26,10 +25,7 @@ def moments_study(
         if progress is not None:
             progress(done, total)
 
-    outcomes = {
-        name: run_case(name, n if name != "c" else max(2, n // _PLANE_SHARE), seed + i, told)
-        for i, name in enumerate(CASES)
-    }
+    outcomes = {name: run_case(name, n, seed + i, told) for i, name in enumerate(CASES)}
     draw_moments(folder, outcomes)
     return moments_metrics(outcomes)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from operator import index
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ __all__ = ["GridDensity", "GridFilter"]
 
 _MOST_MATRICES = 8  # different intervals for which transition matrices are made
 _DEFAULT = {1: 320, 2: 120}
+_ON_EDGE = 0.01  # share of a posterior that the outermost cells may hold
 _COARSER = 2  # the error is judged against a grid with so many times fewer cells
 
 
@@ -93,7 +95,7 @@ class GridFilter:
         error = None
         if self.estimate_error:
             rough = _filtered(given, axes_within(low, high, tuple(max(8, n // _COARSER) for n in cells)))
-            error = _distance(found, rough) / (_COARSER**2 - 1)
+            error = _distance(found, rough, axes_within(low, high, cells)) / (_COARSER**2 - 1)
         return _estimates(given, found, error)
 
     def densities(
@@ -115,16 +117,27 @@ class GridFilter:
         n = given.model.n_state
         if n not in _DEFAULT:
             raise ModelError(f"a grid serves 1 or 2 dimensions, not {n}. Use ParticleFilter or MomentFilter.")
-        asked = _DEFAULT[n] if self.cells is None else self.cells
-        cells = (asked,) * n if isinstance(asked, int) else tuple(asked)
-        if len(cells) != n or min(cells) < 8:
-            raise ModelError(f"cells must be at least 8 on each of {n} axes, got {self.cells}.")
+        cells = _cells(_DEFAULT[n] if self.cells is None else self.cells, n)
         if self.bounds is None:
             return *reach(given.model, float(given.dts.sum())), cells
-        low, high = (np.broadcast_to(np.asarray(side, dtype=np.float64), (n,)) for side in self.bounds)
+        try:
+            low, high = (np.broadcast_to(np.asarray(side, dtype=np.float64), (n,)) for side in self.bounds)
+        except (TypeError, ValueError):
+            raise ModelError(f"bounds must be (low, high), each of {n} components, got {self.bounds!r}.") from None
         if not (low < high).all():
             raise ModelError(f"bounds must be (low, high) with low < high, got {self.bounds}.")
         return low, high, cells
+
+
+def _cells(asked: int | Sequence[int], n: int) -> tuple[int, ...]:
+    """Number of cells on each of n axes."""
+    try:
+        cells = tuple(index(count) for count in np.broadcast_to(np.asarray(asked), (n,)))
+    except (TypeError, ValueError):
+        cells = ()
+    if not cells or min(cells) < 8:
+        raise ModelError(f"cells must be whole numbers, at least 8 on each of {n} axes, got {asked!r}.")
+    return cells
 
 
 class _Step(NamedTuple):
@@ -168,8 +181,27 @@ def _steps(given: Observation, axes: Axes) -> Iterator[_Step]:
                 "Check its unit, or give wider bounds."
             )
         p = (flat / total[:, None, None]).reshape(p.shape)
+        _inside(p, axes, k, z)
         seen = (~np.isnan(z)).any(-1)
         yield _Step(p, np.where(seen, np.log(total) + top[:, 0, 0], 0.0), nis)
+
+
+def _inside(p: Float[np.ndarray, "b s *cells"], axes: Axes, k: int, z: Float[np.ndarray, "b m"]) -> None:
+    """Refuse a posterior that leans on the edge of the grid: where it ends is then the grid's doing.
+
+    Raises:
+        DataError: the outermost cells of an axis hold more than a hundredth.
+    """
+    for axis in range(len(axes.centres)):
+        line = p.sum(axis=tuple(i for i in range(1, p.ndim) if i != 2 + axis))
+        share = line[:, 0] + line[:, -1]
+        if share.max() > _ON_EDGE:
+            run, c = int(share.argmax()), axes.centres[axis]
+            raise DataError(
+                f"row {k}: measurement {z[run]} of run {run} puts {100 * share[run]:.0f} % of the posterior on the "
+                f"edge of the grid, which reaches from {c[0]:g} to {c[-1]:g} on axis {axis}.\n"
+                "Check its unit, or give wider bounds=(low, high)."
+            )
 
 
 def _propagators(rates: Generator, dts: Float[np.ndarray, " t"]) -> dict[float, Propagator]:
@@ -201,10 +233,11 @@ def _filtered(given: Observation, axes: Axes) -> _Found:
     return _Found(*(np.stack(parts, axis=1) for parts in zip(*rows, strict=True)))
 
 
-def _distance(a: _Found, b: _Found) -> Float[np.ndarray, "b t"]:
-    """Distance of the means in units of the posterior's standard deviations."""
+def _distance(a: _Found, b: _Found, axes: Axes) -> Float[np.ndarray, "b t"]:
+    """Distance of the means in units of the posterior's standard deviations, those within a cell included."""
     off = a.mean - b.mean
-    return np.asarray(np.sqrt(np.einsum("...i,...ij,...j->...", off, np.linalg.inv(a.cov), off)))
+    cov = a.cov + np.diag(np.square(axes.widths)) / 12
+    return np.asarray(np.sqrt(np.einsum("...i,...ij,...j->...", off, np.linalg.inv(cov), off)))
 
 
 def _estimates(given: Observation, found: _Found, error: Float[np.ndarray, "b t"] | None) -> Estimates:

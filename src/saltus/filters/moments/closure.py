@@ -11,15 +11,22 @@ from saltus.filters.moments.belief import Moments, Points
 from saltus.filters.moments.maxent import Fit, fit, gaussian_parameter, tables
 from saltus.filters.moments.realisable import margin, shrunk
 
-__all__ = ["Closing", "ClosureName", "Density", "Tally"]
+__all__ = ["Closing", "ClosureName", "Density", "Tally", "reach"]
 
 _Array = npt.NDArray[np.float64]
 ClosureName = Literal["maxent", "hermite", "gaussian"]
 
-REACH = 5.5  # half width of the box, in standard deviations
+# Half width of the box by order, in standard deviations. Laws that switching makes have heavy tails: sixth moments feel
+# what lies beyond 5.5, and a box that cannot hold it bends the density inside.
+_REACH = {2: 5.5, 4: 5.5, 6: 6.5}
 NEAR = 4.2  # the same about a posterior, whose nodes are spread by 1.3
 _HOPELESS = -1e3  # moment matrix so far from positive that even the raw closure begins anew
 _HALF_LOG_2PI = 0.5 * float(np.log(2 * np.pi))
+
+
+def reach(order: int) -> float:
+    """Half width of the box of maximum-entropy densities of an order, in standard deviations."""
+    return _REACH[order]
 
 
 class Density(NamedTuple):
@@ -34,7 +41,7 @@ class Density(NamedTuple):
         """Log of the modulus and sign of the densities at points."""
         if self.name == "maxent":
             # Off the box, where the polynomial may rise, go on as a Gaussian does: an edge would spoil quadratures.
-            near = np.clip(xi, -REACH, REACH)
+            near = np.clip(xi, -reach(self.basis.order), reach(self.basis.order))
             series = self.basis.series(self.coefficients, near)
             return series - 0.5 * (np.square(xi) - np.square(near)).sum(-1), np.ones_like(series)
         series = self.basis.series(self.coefficients, xi)
@@ -76,10 +83,10 @@ class Closing:
         self.name: ClosureName = name
         self.basis = basis(n, order)
         self.protected = protected
-        self.rule: Rule = gauss_legendre(n, count, REACH) if name == "maxent" else gauss_hermite(n, count)
+        self.rule: Rule = gauss_legendre(n, count, reach(order)) if name == "maxent" else gauss_hermite(n, count)
         # Where a posterior is looked at its spread is known: fewer deviations need be covered.
         self.near: Rule = gauss_legendre(n, count, NEAR) if name == "maxent" else self.rule
-        self._tables = tables(n, order, count, REACH) if name == "maxent" else None
+        self._tables = tables(n, order, count, reach(order)) if name == "maxent" else None
         self._last: _Array | None = None
         self._n_runs = n_runs
         self.tally = self._none()
@@ -165,7 +172,7 @@ class Closing:
             marked = bad.copy()
             marked[bad] = changed if attempt == "shrunk" else True
             self._count(attempt, marked, n_modes)
-            by = tables(n, kept, len(np.unique(self.rule.nodes[:, 0])), REACH)
+            by = tables(n, kept, len(np.unique(self.rule.nodes[:, 0])), reach(order))
             size = by.values.shape[0]
             if kept == 2:
                 rows = np.where(self.basis.degree == 0, 1.0, 0.0) * np.ones_like(rows)

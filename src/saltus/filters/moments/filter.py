@@ -23,7 +23,7 @@ from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE
 
 __all__ = ["MomentFilter"]
 
-_NODES = {"maxent": {1: 48, 2: 24, 3: 14}, "hermite": {1: 36, 2: 20, 3: 10}, "gaussian": {1: 36, 2: 20, 3: 10}}
+_NODES = {"maxent": {1: 48, 2: 28, 3: 14}, "hermite": {1: 36, 2: 20, 3: 10}, "gaussian": {1: 36, 2: 20, 3: 10}}
 _MOST_NODES = 20_000
 Closure = Literal["maxent", "hermite", "gaussian", "auto"]
 Representation = Literal["grid", "sum", "maxent", "gaussian", "hermite"]
@@ -75,6 +75,11 @@ class MomentFilter:
                 f"order must be 2 to 6, and even for maximum entropy (an odd leading power has no positive density): "
                 f"{self.order}."
             )
+        least = (4 if self.closure == "gaussian" else self.order) + 1
+        if self.nodes is not None and self.nodes < least:
+            raise ModelError(f"order {self.order} needs nodes >= {least} on each axis, got {self.nodes}; None chooses.")
+        if self.substeps is not None and self.substeps < 1:
+            raise ModelError(f"substeps must be at least 1, got {self.substeps}; None chooses by the drift.")
         if self.adapt is not None and self.closure not in ("maxent", "hermite"):
             raise ModelError('adapt needs closure="maxent" or "hermite".')
 
@@ -142,7 +147,7 @@ class MomentFilter:
         chosen = self.representation(given.model, given.sensor)
         if chosen in ("grid", "sum"):
             raise ModelError(f'for this model "auto" is a {chosen}, which has no closure to follow. Name a closure.')
-        seen = None if switches is None else checked_switches(given.model, switches)
+        seen = None if switches is None else checked_switches(given, switches)
         if seen is not None and self.adapt is not None:
             raise ModelError("seen switches and adaptive order do not go together: name one order.")
         return self._follow(given, chosen, seen)

@@ -63,6 +63,8 @@ class GaussianSumFilter:
         del rng
         if self.components < 1:
             raise ModelError(f"a Gaussian sum needs at least one component per mode, got {self.components}.")
+        if self.nodes is not None and self.nodes < 3:
+            raise ModelError(f"a Gaussian needs nodes >= 3 on each axis, got {self.nodes}; None chooses.")
         given = observation(model, sensor, z, times, t0)
         return estimates_of(given, list(_Sum(given, self.components, self.nodes).rows()), self.per_mode)
 

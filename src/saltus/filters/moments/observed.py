@@ -15,6 +15,7 @@ from jaxtyping import Float
 from saltus.errors import DataError
 from saltus.filters.moments.belief import Points, root_of
 from saltus.filters.moments.closure import Closing
+from saltus.filters.observation import Observation
 from saltus.models import SwitchingSDE
 
 __all__ = ["SeenSwitch", "certain", "checked_switches", "switched"]
@@ -31,16 +32,25 @@ class SeenSwitch(NamedTuple):
 
 
 def checked_switches(
-    model: SwitchingSDE, switches: Sequence[SeenSwitch | tuple[float, int, int]]
+    given: Observation, switches: Sequence[SeenSwitch | tuple[float, int, int]]
 ) -> tuple[SeenSwitch, ...]:
-    """Check that switches follow on each other and can happen.
+    """Check that switches follow on each other, can happen, and lie between the start and the last measurement.
 
     Raises:
-        DataError: they go back in time, do not connect, or have no rate.
+        DataError: they go back in time, lie outside, do not connect, or have no rate.
     """
+    wrong = [switch for switch in switches if len(switch) != 3]
+    if wrong:
+        raise DataError(f"switches are (time, from, to), got {wrong[0]!r}.")
     seen = tuple(SeenSwitch(*switch) for switch in switches)
+    start, end = float(given.times[0] - given.dts[0]), float(given.times[-1])
     for k, switch in enumerate(seen):
-        if (switch.source, switch.target) not in model.switches:
+        if not start <= switch.time <= end:
+            raise DataError(
+                f"switch {k} at {switch.time:g} s does not lie between the start, {start:g} s, and the last "
+                f"measurement, {end:g} s. Leave it out, or give times with rows of NaN up to it."
+            )
+        if (switch.source, switch.target) not in given.model.switches:
             raise DataError(f"switch {k}, {switch.source} -> {switch.target}, has no intensity in this model.")
         if k and (switch.time < seen[k - 1].time or switch.source != seen[k - 1].target):
             raise DataError(

@@ -17,6 +17,7 @@ __all__ = ["MomentPosterior"]
 _Array = npt.NDArray[np.float64]
 
 _MESH = 4001  # points at which a distribution function is looked at
+_LIGHT = 1e-7  # share of the heaviest line below which one does not matter
 _ROUNDS = 24  # of the search for a mode, each halving its mesh
 
 
@@ -94,22 +95,15 @@ class MomentPosterior:
         return np.asarray(best)
 
     def median(self) -> Float[np.ndarray, "b n"]:
-        """Median of every coordinate, from the modes' distribution functions through their points."""
-        from scipy.interpolate import PchipInterpolator
-
-        out = np.empty((len(self.points.points), self.points.points.shape[-1]))
-        for run, axis in np.ndindex(*out.shape):
-            lines = []
-            for mode in range(self.points.log_probs.shape[1]):
-                place, inverse = np.unique(self.points.points[run, mode, :, axis], return_inverse=True)
-                mass = np.bincount(inverse, weights=self.points.weights[run, mode], minlength=len(place))
-                level = np.cumsum(mass) - 0.5 * mass
-                lines.append((self.probs[run, mode], PchipInterpolator(place, level, extrapolate=False), place))
-            y = np.linspace(min(line[2][0] for line in lines), max(line[2][-1] for line in lines), _MESH)
-            total = np.zeros(_MESH)
-            for prob, level_at, place in lines:
-                total += prob * np.where(y < place[0], 0.0, np.where(y > place[-1], 1.0, np.nan_to_num(level_at(y))))
-            out[run, axis] = np.interp(0.5, np.maximum.accumulate(total), y)
+        """Median of every coordinate, from distribution functions along the lines of points that vary it alone."""
+        joint = self.probs[..., None] * self.points.weights
+        n_runs, n_modes, count, n = self.points.points.shape
+        grid = (n_modes, *(round(count ** (1 / n)),) * n)
+        out = np.empty((n_runs, n))
+        for run, axis in np.ndindex(n_runs, n):
+            y = np.moveaxis(self.points.points[run, ..., axis].reshape(grid), 1 + axis, -1)
+            mass = np.moveaxis(joint[run].reshape(grid), 1 + axis, -1)
+            out[run, axis] = _middle(y.reshape(-1, grid[-1]), mass.reshape(-1, grid[-1]))
         return out
 
     def _joint(self, mode: int | None) -> _Array:
@@ -125,3 +119,18 @@ class MomentPosterior:
         n_modes = self.points.log_probs.shape[1]
         each = [self.log_pdf(y, s) + self.points.log_probs[:, s, None] for s in range(n_modes)]
         return np.asarray(np.max(each, axis=0))
+
+
+def _middle(y: Float[np.ndarray, "lines q"], mass: Float[np.ndarray, "lines q"]) -> float:
+    """Median of what lies on lines of points, spread between them; y increases along each line."""
+    from scipy.interpolate import PchipInterpolator
+
+    weight = mass.sum(axis=-1)
+    heavy = weight > _LIGHT * weight.max()
+    y, mass = y[heavy], mass[heavy]
+    mesh = np.linspace(y.min(), y.max(), _MESH)
+    total = np.zeros(_MESH)
+    for place, part in zip(y, mass, strict=True):
+        level = PchipInterpolator(place, np.cumsum(part) - 0.5 * part)
+        total += np.where(mesh > place[-1], part.sum(), np.where(mesh < place[0], 0.0, level(mesh)))
+    return float(np.interp(0.5 * total[-1], np.maximum.accumulate(total), mesh))
