@@ -1,8 +1,21 @@
 """Switching diffusions of the moment-filter notes, section 11; written out here, not taken from the study."""
 
+from contextlib import contextmanager
+
+import jaxtyping
 import numpy as np
 
 from saltus import DiffusionSensor, SwitchingSDE
+
+
+@contextmanager
+def unchecked():
+    """As users run it: annotations are not executed, and what is refused is refused by the package itself."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        yield
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
 
 
 def double_well(y):

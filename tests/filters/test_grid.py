@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from diffusions import case, distances, exact_mixture, few
+from diffusions import case, distances, exact_mixture, few, unchecked
 from saltus import (
     Chain,
     DataError,
@@ -207,6 +207,25 @@ def test_what_a_grid_cannot_do_is_refused():
         GridFilter().run(model, sensor, z, [0.4, 0.2])
     with pytest.raises(DataError, match="holds infinity"):
         GridFilter().run(model, sensor, np.full((2, 1), np.inf), times)
+    with unchecked(), pytest.raises(DataError, match="z must be an array of numbers"):
+        GridFilter().run(model, sensor, [["north"], ["south"]], times)
+    with pytest.raises(DataError, match=r"z holds no run: its shape is \(0, 2, 1\)"):
+        GridFilter().run(model, sensor, np.zeros((0, 2, 1)), times)
+    with pytest.raises(DataError, match="times must be finite: t0 is 0 s, row 1 has nan s"):
+        GridFilter().run(model, sensor, z, [0.2, np.nan])
+    with pytest.raises(
+        DataError, match=r"row 0: measurement \[1000.\] of run 0 puts 100 % of the posterior on the edge"
+    ):
+        GridFilter().run(model, sensor, np.full((2, 1), 1e3), times)
+    with pytest.raises(DataError, match="on the edge of the grid, which reaches from 10"):
+        GridFilter(bounds=(10, 20)).run(model, sensor, z, times)
+    with unchecked(), pytest.raises(ModelError, match="must be a SwitchingSDE or a HybridModel, got NoneType"):
+        GridFilter().run(None, sensor, z, times)
+    for cells in ("a", 60.0, (60, 60)):
+        with unchecked(), pytest.raises(ModelError, match="cells must be whole numbers"):
+            GridFilter(cells).run(model, sensor, z, times)
+    with unchecked(), pytest.raises(ModelError, match=r"bounds must be \(low, high\), each of 1"):
+        GridFilter(bounds=3.0).run(model, sensor, z, times)
     with pytest.raises(ModelError, match="needs a DiffusionSensor, got str"):
         GridFilter().run(model, "radar", z, times)
     three = SwitchingSDE(drift=[lambda y: -y], diffusion=[1.0], intensity={}, mean0=np.zeros(3), cov0=np.eye(3))

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from diffusions import case, few, leaving
+from diffusions import case, few, leaving, unchecked
 from saltus import DataError, DiffusionSensor, MomentFilter, NumericalError, SwitchingSDE
 from saltus.filters.grid.bounds import axes_within
 from saltus.filters.grid.generator import generator
@@ -21,7 +21,8 @@ from saltus.filters.moments.closure import Closing
 from saltus.filters.moments.flow import Flow, constant_noise, predict_by_flow
 from saltus.filters.moments.rates import moment_rates
 from saltus.filters.moments.realisable import MARGIN, deviation, margin, shrunk
-from saltus.filters.moments.recursion import first_moments
+from saltus.filters.moments.recursion import Recursion, Setting, first_moments
+from saltus.filters.observation import observation
 
 
 @pytest.mark.parametrize(("n", "order"), [(1, 6), (2, 4), (3, 3)])
@@ -178,6 +179,33 @@ def test_raw_hermite_moments_fail_and_every_failure_is_seen(cases):
             np.testing.assert_allclose(e.probs.sum(-1), 1.0, rtol=1e-9)
 
 
+def hankel(y, w):
+    """Smallest eigenvalue of the matrix <xi^(i + j)>, i, j <= 3, of standardised signed points; NaN if none."""
+    mean = (w * y).sum(-1, keepdims=True)
+    var = (w * (y - mean) ** 2).sum(-1, keepdims=True)
+    xi = (y - mean) / np.sqrt(np.where(var > 0, var, np.nan))
+    m = np.stack([(w * xi**k).sum(-1) for k in range(7)], axis=-1)
+    matrix = m[..., np.add.outer(np.arange(4), np.arange(4))]
+    good = np.isfinite(matrix).all((-1, -2))
+    return np.where(good, np.linalg.eigvalsh(np.where(good[..., None, None], matrix, 0.0))[..., 0], np.nan)
+
+
+@pytest.mark.parametrize("name", ["a1", "a2", "br"])
+def test_no_raw_failure_is_silent(cases, name):
+    """The guard against moments computed here from the points: whatever no density has is marked, in its row."""
+    part = few(cases(f"moments_{name}"), 5, 30)
+    recursion = Recursion(
+        observation(*case(name), part["z"], part["times"], 0.0), Setting("hermite", 6, 36, False, None)
+    )
+    caught = 0
+    for row in recursion.rows(recursion.start(), 0, 30):
+        least = hankel(row.points.points[..., 0], row.points.weights)
+        impossible = ~(least > -1e-9).all(axis=1)
+        assert row.failed[impossible].all()
+        caught += int(impossible.sum())
+    assert caught > 0
+
+
 def test_deviation_is_that_of_skewness_and_kurtosis_and_does_not_depend_on_axes(rng):
     g1, g2 = 0.25, 0.5
     assert deviation(basis(1, 4), gammas(g1, g2))[0] == pytest.approx(g1**2 / 12 + g2**2 / 48)
@@ -297,6 +325,11 @@ def test_a_seen_switch_hands_the_state_over_or_restores_it():
         MomentFilter().follow(model, sensor, z, [0.5, 1.0], switches=[(0.1, 0, 1), (0.2, 0, 1)])
     with pytest.raises(DataError, match="has no intensity"):
         MomentFilter().follow(model, sensor, z, [0.5, 1.0], switches=[(0.1, 0, 0)])
+    for late in (-0.1, 1.1, np.nan):
+        with pytest.raises(DataError, match=r"does not lie between the start, 0 s, and the last measurement, 1 s"):
+            MomentFilter().follow(model, sensor, z, [0.5, 1.0], switches=[(late, 0, 1)])
+    with unchecked(), pytest.raises(DataError, match=r"switches are \(time, from, to\)"):
+        MomentFilter().follow(model, sensor, z, [0.5, 1.0], switches=[(0, 1)])
 
 
 # --- moments that stand still --------------------------------------------------------------------------
@@ -323,11 +356,27 @@ def test_stationary_moments_are_those_of_the_table(closure, order):
     assert (margin(basis(1, max(order, 2)), found.h) > 0).all()
 
 
-def test_roots_that_no_density_has_are_rejected():
-    """Raw order 4 has several roots for a deep double well; what is returned is realisable."""
-    deep = SwitchingSDE(drift=[lambda y: 8 * (y - y**3)], diffusion=[0.5], intensity={}, cov0=[[0.3]])
-    found = stationary_moments(deep, closure="hermite", order=4)
-    assert (margin(basis(1, 4), found.h) > 0).all() and found.cov[0, 0, 0] > 0
+@pytest.mark.parametrize(
+    ("drift", "noise", "start"),
+    [
+        (lambda y: 4 * (y - y**3 + 0.4), 0.3, (1.5, 4.0)),  # the first two roots have kurtosis < 1 + skewness^2
+        (lambda y: 2 * (y - y**3), 0.8, (0.0, 3.0)),  # the first has an excess of 33, where the density has two humps
+    ],
+)
+def test_roots_that_no_density_has_are_rejected(drift, noise, start):
+    well = SwitchingSDE([drift], [noise], {}, mean0=[start[0]], cov0=[[start[1]]])
+    found = stationary_moments(well, closure="hermite", order=4)
+    assert found.rejected >= 1
+    y = np.linspace(-3, 3, 6001)
+    log_p = 2 / noise**2 * np.cumsum(drift(y)) * (y[1] - y[0])  # 2 int a / b^2
+    p = np.exp(log_p - log_p.max())
+    p /= p.sum()
+    mean = p @ y
+    # The roots refused are far off: -0.17 for a mean of 1.16, a variance of 0.08 for 0.84, where order 4 has 0.54.
+    assert found.mean[0, 0] == pytest.approx(mean, abs=0.01)
+    assert 0.6 < found.cov[0, 0, 0] / (p @ (y - mean) ** 2) < 1.1
+    skewness, excess = found.h[0, 3] * np.sqrt(6), found.h[0, 4] * np.sqrt(24)
+    assert excess + 2 > skewness**2
 
 
 def test_higher_moments_are_found_for_a_given_start():

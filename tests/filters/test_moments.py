@@ -214,11 +214,11 @@ def test_auto_takes_what_suits_the_model():
 
 
 def test_order_rises_only_where_it_changes_something(cases):
-    part = few(cases("moments_a2"), 3, 15)
-    model, sensor = case("a2")
-    history = MomentFilter(adapt=Adapt()).follow(model, sensor, part["z"], part["times"])
-    assert (history.diagnostics.order >= 4).mean() > 0.8
-    assert distances(history.estimates, part)[0] < 0.05  # `relative`
+    for name in ("a1", "a2", "b", "br"):  # a Gaussian closure with a linear sensor sees Gaussians only: b, br
+        part = few(cases(f"moments_{name}"), 3, 15)
+        history = MomentFilter(adapt=Adapt()).follow(*case(name), part["z"], part["times"])
+        assert (history.diagnostics.order >= 4).mean() > 0.8, name
+        assert distances(history.estimates, part)[0] < 0.05, name  # `relative`
     alone = SwitchingSDE(drift=[lambda y: -y], diffusion=[1.0], intensity={})
     z = np.random.default_rng(0).standard_normal((2, 20, 1))
     linear = DiffusionSensor(h=[lambda y: y], R=[0.5])
@@ -228,6 +228,32 @@ def test_order_rises_only_where_it_changes_something(cases):
     np.testing.assert_allclose(calm.estimates.mean, plain.mean, atol=1e-6)
     x = np.linspace(-1, 1, 5)[:, None]
     assert np.isfinite(calm.posterior.log_pdf(x)).all()
+
+
+def test_order_six_is_used_where_order_four_does_not_settle(cases):
+    part = few(cases("moments_br"), 3, 12)
+    model, sensor = case("br")
+    adapt = Adapt(relative=1e-4, interval=12)
+    history = MomentFilter(adapt=adapt).follow(model, sensor, part["z"], part["times"])
+    assert (history.diagnostics.order == 6).all() and history.diagnostics.unsettled.all()
+    six = MomentFilter(order=6).run(model, sensor, part["z"], part["times"])
+    np.testing.assert_allclose(history.estimates.mean, six.mean, atol=1e-3)
+    capped = MomentFilter(adapt=adapt._replace(max_order=4)).follow(model, sensor, part["z"], part["times"])
+    assert (capped.diagnostics.order == 4).all() and capped.diagnostics.unsettled.all()
+    four = MomentFilter(order=4).run(model, sensor, part["z"], part["times"])
+    np.testing.assert_allclose(capped.estimates.mean, four.mean, atol=1e-3)
+    assert np.abs(six.mean - four.mean).max() > 0.01
+
+
+def test_order_six_is_closer_where_switching_makes_heavy_tails(cases):
+    """Restoration: sixth moments feel what lies beyond a box of 5.5 deviations."""
+    part = few(cases("moments_br"), 12, 30)
+    model, sensor = case("br")
+    four, six = (
+        distances(MomentFilter(order=order).run(model, sensor, part["z"], part["times"]), part) for order in (4, 6)
+    )
+    assert six[0] < 0.04 and six[1] < 0.05 and six[2] < 0.02
+    assert six[0] < 0.7 * four[0] and six[1] < 0.7 * four[1]
 
 
 def test_runs_do_not_depend_on_each_other(cases):
@@ -260,6 +286,8 @@ def test_modes_may_be_listed_in_any_order(cases):
         ({"order": 3}, "even for maximum entropy"),
         ({"order": 8, "closure": "hermite"}, "order must be 2 to 6"),
         ({"closure": "gaussian", "adapt": Adapt()}, "adapt needs"),
+        ({"nodes": 4}, "order 4 needs nodes >= 5 on each axis, got 4"),
+        ({"substeps": 0}, "substeps must be at least 1, got 0"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings, words):
@@ -278,3 +306,5 @@ def test_what_does_not_fit_is_refused():
         MomentFilter(adapt=Adapt(interval=0)).run(model, sensor, np.zeros((1, 1)), [0.2])
     with pytest.raises(ModelError, match="at least one component"):
         GaussianSumFilter(0).run(model, sensor, np.zeros((1, 1)), [0.2])
+    with pytest.raises(ModelError, match="nodes >= 3"):
+        GaussianSumFilter(nodes=1).run(model, sensor, np.zeros((1, 1)), [0.2])

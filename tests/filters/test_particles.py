@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from diffusions import unchecked
 from saltus import ModelError
 from saltus.filters.particles import effective_size, generator, group_error, merged, systematic
 
@@ -66,5 +67,7 @@ def test_one_component_is_student_s_interval(rng):
 
 
 def test_a_filter_that_draws_needs_a_source():
+    with unchecked(), pytest.raises(ModelError, match="rng must be a generator, got 7"):
+        generator(7)
     with pytest.raises(ModelError, match=r"pass rng=np\.random\.default_rng"):
         generator(None)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from diffusions import case
+from diffusions import case, unchecked
 from saltus import (
     Chain,
     DataError,
@@ -63,9 +63,23 @@ def test_rates_add_up_to_the_exit_rate(rng):
         ({"drift": [lambda y: np.full_like(y, np.nan)] * 2}, r"drift\[0\] is not finite at state"),
         ({"drift": [[1.0, 2.0]] * 2}, r"drift\[0\] has shape \(2,\), but must have \(1,\)"),
         ({"intensity": {(0, 1): -0.1}}, r"intensity\[\(0, 1\)\] is -0.1 per second at state .*not be negative"),
+        ({"intensity": {(0, 1): np.nan}}, "holds nan"),
+        ({"intensity": [0.1, 0.2]}, r"dictionary of rates by \(from, to\)"),
+        ({"drift": np.sin}, "list with one entry per mode"),
+        ({"diffusion": 0.6}, "list with one entry per mode"),
+        (
+            {"diffusion": [[0.8], 0.6]},
+            r"diffusion\[0\] has shape \(1,\), but must have \(1, w\).*\n.*one row per component",
+        ),
+        ({"diffusion": [lambda y: y, 0.6]}, r"must keep leading axes: \(2, 5, 1, w\)"),
+        ({"drift": [lambda y: y if y > 0 else -y] * 2}, r"drift\[0\] failed for states .*\n.*np.where for branches"),
         ({"intensity": {(0, 0): 0.1}}, r"key \(0, 0\); keys are \(from, to\)"),
         ({"intensity": {(0, 2): 0.1}}, "two different modes of 0..1"),
         ({"intensity": {(0, 1): lambda y: y**2}}, "must keep leading axes"),
+        ({"restore": {(1, 0): ([0.0], [[1.0]])}}, r"restore has \(1, 0\), a switch without intensity"),
+        ({"restore": {(0, 1): 1.5}}, r"restore\[\(0, 1\)\] must be \(mean, cov\)"),
+        ({"restore": 1.5}, r"restore must be a dictionary"),
+        ({"mean0": 0.0}, r"mean0 must be \(n,\).*Write \[0.0\]"),
         ({"restore": {(0, 1): ([0.0, 1.0], np.eye(2))}}, r"restore\[\(0, 1\)\] must be a mean \(1,\)"),
         ({"restore": {(0, 1): ([0.0], [[-1.0]])}}, "positive semi-definite"),
         ({"probs0": [0.5, 0.6]}, "sum to 1"),
@@ -74,11 +88,22 @@ def test_rates_add_up_to_the_exit_rate(rng):
     ],
 )
 def test_what_cannot_be_is_refused(changes, words):
-    with pytest.raises(ModelError, match=words):
+    with unchecked(), pytest.raises(ModelError, match=words):
         two_modes(**changes)
 
 
+def test_a_rate_that_falls_below_zero_far_out_is_refused_where_a_filter_looks():
+    model = two_modes(intensity={(0, 1): lambda y: 9.0 - y[..., 0]})
+    assert model.rate((0, 1), np.array([8.0])) == 1.0
+    with pytest.raises(ModelError, match=r"is -1 per second at state \[10.\].*\n.*np.maximum"):
+        model.exit_rate(0, np.array([[8.0], [10.0]]))
+
+
 def test_a_sensor_is_refused_with_the_reason():
+    with unchecked(), pytest.raises(ModelError, match="h must be a list with one entry per mode"):
+        DiffusionSensor(h=np.sin, R=[1.0])
+    with unchecked(), pytest.raises(ModelError, match="angular must be a list with one entry per component, got 0"):
+        DiffusionSensor(h=[lambda y: y], R=[1.0], angular=0)
     with pytest.raises(ModelError, match="one h and one R per mode: got 2 and 1"):
         DiffusionSensor(h=[lambda y: y] * 2, R=[1.0])
     with pytest.raises(ModelError, match="positive definite"):

@@ -1,8 +1,10 @@
 """Raising the order where it matters: 2 -> 4 -> 6, judged over control intervals, run by run.
 
-An interval is filtered at order 2. Runs whose posteriors are Gaussian by the measure J keep it; the others are
-repeated at order 4, and where that changes means or variances by more than a limit, at order 6, which is used where it
-differs from order 4 by more than the limit again.
+An interval is filtered at order 2. Runs whose densities stay Gaussian by the measure J keep it: the posterior's, and
+what the predictions of the interval bring together. A Gaussian closure forgets at every step what the step has bent, so
+that each alone says little: sqrt(J) is summed, as if nothing were forgotten. The other runs are repeated at order 4,
+and where that changes means or variances by more than a limit, at order 6, which is used where it differs from order 4
+by more than the limit again.
 
 Source: moment-filter notes, section 8, which mends the paper's (23)-(30).
 """
@@ -17,6 +19,7 @@ from saltus.filters.moments.belief import Points, moments_of
 from saltus.filters.moments.closure import Closing, Tally
 from saltus.filters.moments.history import Kept, MomentHistory, estimates_of, kept, recorded
 from saltus.filters.moments.posterior import MomentPosterior
+from saltus.filters.moments.realisable import deviation
 from saltus.filters.moments.recursion import Recursion, Setting
 from saltus.filters.observation import Observation
 
@@ -29,8 +32,8 @@ class Adapt(NamedTuple):
     """When to raise the order.
 
     Attributes:
-        deviation: largest mean of J over an interval that passes as Gaussian, nats; 0.0104 is |skewness| = 0.25 and
-            |excess| = 0.5 together.
+        deviation: largest J over an interval that passes as Gaussian, nats; 0.0104 is |skewness| = 0.25 and |excess| =
+            0.5 together.
         relative: largest change of a mean, in standard deviations, or of the log of a variance, that settles.
         interval: number of measurements judged together.
         max_order: 4 or 6.
@@ -46,6 +49,7 @@ class _Part(NamedTuple):
     """An interval of some runs at one order: moments and repairs of its rows, and the points after the last."""
 
     kept: list[Kept]
+    foreseen: _Array  # J of the predicted densities if no row forgot the one before, (b,)
     tally: list[Tally]
     failed: list[npt.NDArray[np.bool_]]
     points: Points
@@ -111,6 +115,7 @@ def _taken(part: _Part, which: npt.NDArray[np.bool_]) -> _Part:
     """Some of the runs of a part."""
     return _Part(
         [Kept(*(a[which] for a in row)) for row in part.kept],
+        part.foreseen[which],
         [Tally(*(a[which] for a in tally)) for tally in part.tally],
         [failed[which] for failed in part.failed],
         Points(*(a[which] for a in part.points)),
@@ -121,12 +126,16 @@ def _filtered(given: Observation, setting: Setting, points: Points, runs: npt.ND
     recursion = Recursion(given._replace(z=given.z[runs]), setting)
     rows = list(recursion.rows(Points(*(a[runs] for a in points)), span.start, span.stop))
     moments = [kept(row.points, row.log_likelihood, row.nis) for row in rows]
-    return _Part(moments, [row.tally for row in rows], [row.failed for row in rows], rows[-1].points)
+    laws = [row.predicted.law for row in rows]
+    bent = [(np.exp(law.log_probs) * deviation(recursion.closing.basis, law.h)).sum(axis=1) for law in laws]
+    foreseen = np.asarray(np.square(np.sqrt(bent).sum(axis=0)))
+    return _Part(moments, foreseen, [row.tally for row in rows], [row.failed for row in rows], rows[-1].points)
 
 
 def _mean_deviation(part: _Part) -> _Array:
-    """J over the interval and over the modes, by their probabilities."""
-    return np.asarray(np.mean([(np.exp(k.log_probs) * k.deviation).sum(axis=1) for k in part.kept], axis=0))
+    """J over the interval and over the modes, by their probabilities: the larger of posterior and predicted."""
+    found = np.mean([(np.exp(k.log_probs) * k.deviation).sum(axis=1) for k in part.kept], axis=0)
+    return np.maximum(found, part.foreseen)
 
 
 def _change(before: _Part, after: _Part, runs: npt.NDArray[np.int64]) -> _Array:
@@ -159,6 +168,7 @@ def _joined(everyone: _Part, some: _Part, runs: npt.NDArray[np.int64]) -> _Part:
     pairs = zip(everyone.kept, some.kept, strict=True)
     return _Part(
         [Kept(*(put(a, b) for a, b in zip(old, new, strict=True))) for old, new in pairs],
+        put(everyone.foreseen, some.foreseen),
         [
             Tally(*(put(a, b) for a, b in zip(old, new, strict=True)))
             for old, new in zip(everyone.tally, some.tally, strict=True)

@@ -187,7 +187,8 @@ class MomentFilter:
         n = given.model.n_state
         if self.adapt is not None:
             settings = {2: self.setting(n, "gaussian", 2)}
-            settings[2] = settings[2]._replace(nodes=self.setting(n, closure, 4).nodes)
+            # The Gaussian's prediction is carried to order 4, to see how far from Gaussian it has become.
+            settings[2] = settings[2]._replace(order=4, nodes=self.setting(n, closure, 4).nodes)
             settings |= {order: self.setting(n, closure, order) for order in (4, 6)}
             return adaptive_rows(given, self.adapt, settings, self.per_mode)
         recursion = Recursion(given, self.setting(n, closure, self.order), switches)

@@ -35,6 +35,7 @@ _MOST_STEPS = 3_000
 _FAR = 1e6  # standard deviation, in the state's unit, at which nothing will stand still
 _NEWTON = 60
 _ROOT = 1e-9
+_NEGATIVE = 0.2  # part of a Hermite density below zero at which its moments are an artefact of the series
 _PARTS = 30  # substeps while the start forgets its shape
 
 
@@ -45,7 +46,7 @@ class Stationary(NamedTuple):
         probs, mean, cov: of the modes, (S,), (S, n), (S, n, n).
         h: Hermite moments of the whitened state, (S, A); the first is 1, those of order 1 and 2 are 0.
         residual: largest |d/dt u_a| left, in units of the start's standard deviations.
-        rejected: roots that were moments of no density.
+        rejected: roots that were moments of no density, or whose series is negative by more than a fifth.
         method: "newton" or "marching" in pseudo-time.
     """
 
@@ -89,7 +90,8 @@ def stationary_moments(
             if residual > _ROOT:
                 continue
             law = problem.law(root)
-            if (margin(closing.basis, law.h) > 0).all():
+            negative = -np.minimum(closing.closed(law)[1], 0.0).sum(axis=-1)
+            if (margin(closing.basis, law.h) > 0).all() and (negative < _NEGATIVE).all():
                 return _found(law, residual, rejected, "newton")
             rejected += 1
     if keep_start:
