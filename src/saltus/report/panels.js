@@ -53,7 +53,7 @@ function axis(ctx, panel, box, ends) {
     ctx.stroke();
     ctx.fillStyle = SOFT;
     ctx.textAlign = "right";
-    ctx.fillText(panel.course ? String(v).padStart(3, "0") : panel.chance ? (v === 0.5 ? "½" : v) : panel.left === "FL" ? String(Math.round(v)).padStart(3, "0") : grouped(+v.toPrecision(6)), box.x - 6, level);
+    ctx.fillText(panel.course ? String(v).padStart(3, "0") : panel.chance ? (v === 0.5 ? "½" : v) : panel.left === "FL" ? (v < 0 ? "−" : "") + String(Math.abs(Math.round(v))).padStart(3, "0") : grouped(+v.toPrecision(6)), box.x - 6, level);
   }
   if (!panel.right) return y;
   const scale = panel.unit / panel.second;

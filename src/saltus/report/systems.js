@@ -44,7 +44,10 @@ function localRows(k) {
   return [...rows.values()].sort((a, b) => begin(a) - begin(b));
 }
 
-const chance = (p) => (p > 0.99 ? "> 0.99" : p.toFixed(2));
+const chance = (all) => {
+  const least = Math.min(...all);
+  return "P " + (least > 0.99 ? "> 0.99" : (Math.max(...all) > least ? "≥ " : "") + least.toFixed(2));
+};
 const members = document.querySelector("#members");
 let lanes = [];
 function fillMembers() {
@@ -56,7 +59,7 @@ function fillMembers() {
   }
   const nodes = rows.slice(0, MOST_LOCAL).map((row, n) => {
     const [system, name] = S.local[row.local], canvas = element("canvas", {});
-    const said = !row.spells.length ? "not this object" : n ? "P " + chance(Math.max(...row.spells.map((s) => s[2]))) : "first";
+    const said = !row.spells.length ? "not this object" : n ? chance(row.spells.map((s) => s[2])) : "first";
     listen(canvas, () => state.selected);
     lanes.push({ row, canvas, foot: n === Math.min(rows.length, MOST_LOCAL) - 1 });
     return element("div", { class: "lane" }, element("div", {}, chip(system), element("b", {}, name), element("span", {}, said)), canvas);
@@ -69,7 +72,7 @@ function fillMembers() {
 function paintLane({ row, canvas, foot }, track, cursor) {
   const place = prepare(canvas);
   if (!place) return;
-  const { ctx, width } = place, height = place.height - (foot ? FOOT_LOCAL : 0), left = 22, w = width - left - 8;
+  const { ctx, width } = place, height = place.height - (foot ? FOOT_LOCAL : 0), left = 22, w = width - left - 18;
   const from = U.t[track.first], to = Math.max(U.t[track.end - 1], from + 1);
   const x = (t) => left + Math.min(Math.max((t - from) / (to - from), 0), 1) * w, y = (p) => 4 + (1 - p) * (height - 8);
   canvas.time = (px) => from + ((px - left) / w) * (to - from);
