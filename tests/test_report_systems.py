@@ -10,13 +10,19 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from saltus.identify import Conflict, Decisions, DecisionSettings, Episodes, Evidence
+from saltus.identify import Conflict, Decisions, DecisionSettings, Episodes, Evidence, LocalTracks, join_evidence
 from saltus.report import pairs
 from saltus.report.pairs import pair_rows, step_path, thinned_series, undecided
 from saltus.report.section import systems_section
 from saltus.report.systems import MAX_CONFLICTS, SystemsFound, bias_blocks, conflict_rows, system_rows
 from saltus.run import track_files
+from saltus.run.identified import systems_found
+from saltus.run.pipeline import Identified
+from saltus.tracks.encounters import SystemTracks
+from saltus.tracks.local import LocalSystem
 from saltus.tracks.membership import Segments
+from saltus.tracks.settings import SystemsSettings
+from saltus.tracks.systems import Registered
 from test_report import EVIL, T0, Page, column, render, scene
 
 RULE = DecisionSettings(prior=0.25, hold=30.0)
@@ -154,6 +160,29 @@ def test_names_from_files_stay_text_and_one_system_has_no_section(tmp_path):
     alone = render(tmp_path, **scene())
     assert "systems" not in alone.data
     assert 'id="systems"' not in alone.text and '<th data-sort="t">Systems' not in alone.text
+
+
+def one_track(name, own):
+    """A system with one track of two rows, measurements or another centre's."""
+    rows = LocalTracks(np.zeros(2, int), T0 + np.arange(2.0), np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1)))
+    view = SystemTracks(rows, np.zeros((2, 2)), np.full((2, 2), np.nan), np.array([-1]))
+    measurement = np.arange(2) if own else np.full(2, -1)
+    return LocalSystem(name, view, np.array([-1]), ("",), np.array([T0]), np.array([1]), measurement, 10.0)
+
+
+def test_objects_of_other_centres_alone_are_not_counted():
+    """As in identifications.parquet: two centres agree on one object of which no measurement is there."""
+    systems = [one_track("radar", True), one_track("centre", False), one_track("other centre", False)]
+    lives = Segments(np.arange(3), T0 + np.zeros(3), T0 + np.ones(3), np.array([1, 2, 2]), np.ones(3))
+    nobody = Episodes(*[np.zeros(0, int)] * 2, *[np.zeros(0)] * 3)
+    how = [Registered(s.name, "", None) for s in systems]
+    whole = Identified(systems, how, lives, Decisions(nobody, ()), join_evidence([]))
+    single = Identified(systems[:1], how[:1], lives, whole.decisions, whole.evidence)
+    rows = system_rows(systems_found(whole, SystemsSettings(), {"radar": "R"}))
+    assert [r.common for r in rows] == [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
+    assert [r.identified for r in rows] == [0, 0, 0]
+    assert systems_found(whole, SystemsSettings(), {"radar": "R"}).titles == ("R", "centre", "other centre")
+    assert systems_found(single, SystemsSettings(), {}) is None
 
 
 @pytest.fixture(scope="module")
