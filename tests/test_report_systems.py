@@ -140,7 +140,7 @@ def test_conflicts_are_capped_and_the_page_says_so(tmp_path):
     assert rows[0].tracks == (7, 11)
     page = render(tmp_path, **scene(), systems=whole)
     assert "5 shorter ones are not listed" in page.text
-    assert "1 pair of tracks both claim one track" in page.text
+    assert "1 pair of tracks look like one object" in page.text
 
 
 def test_names_from_files_stay_text_and_one_system_has_no_section(tmp_path):

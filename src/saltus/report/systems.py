@@ -28,7 +28,7 @@ __all__ = [
 MAX_CONFLICTS = 40
 
 CONFLICTS = {
-    "rival": "both claim one track",
+    "rival": "look like one object, but one of them has another partner there",
     "addresses": "are one object by their positions and two by their addresses",
     "places": "have one address at two places",
     "inconsistent": "are one object by themselves, but not with the others of their group",
