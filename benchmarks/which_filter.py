@@ -86,7 +86,8 @@ def diffusion(trials, problem, cells):
     z = simulate_diffusion(model, sensor, times, rng=np.random.default_rng(0), batch=trials).z
     filters = {f"grid, {n} cells": GridFilter(cells=n, estimate_error=False) for n in cells}
     filters |= {"moments, order 2": MomentFilter(order=2, closure="gaussian")}
-    filters |= {"moments, order 4": MomentFilter(), "Gaussian sum, 4": GaussianSumFilter()}
+    filters |= {"moments, order 4": MomentFilter(), "moments, order 6": MomentFilter(order=6)}
+    filters |= {"Gaussian sum, 4": GaussianSumFilter()}
     filters |= {f"{n} particles": ParticleFilter(n) for n in (400, 1600)}
     filters |= {"1600 particles, auxiliary": ParticleFilter(1600, proposal="auxiliary")}
 
