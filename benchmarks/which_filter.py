@@ -105,9 +105,9 @@ def measured(name, problem):
     for title, run in filters.items():
         spent = np.inf
         for _ in range(2):
-            began = time.perf_counter()
+            began = time.process_time()
             est = run()
-            spent = min(spent, time.perf_counter() - began)
+            spent = min(spent, time.process_time() - began)
         gap = (est.mean - best.mean)[..., None]
         square = (gap.swapaxes(-1, -2) @ np.linalg.solve(best.cov, gap))[..., 0, 0] / gap.shape[-2]
         rms = float(np.sqrt(square.mean()))
