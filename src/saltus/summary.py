@@ -36,6 +36,7 @@ class Sensors:
     sites: list[Site | None]
     configured: list[dict[str, float]]  # fields of Noise that the configuration gives
     periods: list[float]  # update period used, s
+    waits: list[float]  # s without a report after which a target counts as missed
     told_periods: list[float]  # as configured or found in the recording, NaN where neither tells
     names: list[str]
     told_systems: list[str]  # system of each source as configured, "" where it is not

@@ -1,6 +1,6 @@
 """Plots that may be faulty and sources that may be degraded: covariances, the filter over scans, and the tracker."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import product
 
 import numpy as np
@@ -312,6 +312,43 @@ def test_impossible_settings_of_faults_are_refused():
     ):
         with pytest.raises(ModelError, match=next(iter(wrong))):
             TrackerSettings(**wrong)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_target_that_looks_like_a_fault_of_another_gets_its_own_track(rng, known):
+    """It comes up 400 m beside one that stands still, between two of its plots, where targets are few."""
+    first, second = 4.0 * np.arange(30), 2.0 + 4.0 * np.arange(10, 30)
+    time = np.concatenate([first, second, first])
+    xy = np.concatenate([np.zeros((30, 2)), np.tile([400.0, 0.0], (20, 1)), np.tile([300e3, 300e3], (30, 1))])
+    code = np.repeat([7, 8, 9], [30, 20, 30]) if known else -1
+    m = measured(time, xy + 5.0 * rng.standard_normal(xy.shape), 5.0, icao24=code)
+    found = run(m)
+    beside = (np.abs(m.position[:, 0] - 400.0) < 50.0) & (m.time > 50.0)
+    at_rest = np.abs(m.position[:, 0]) < 50.0
+    assert len(np.unique(found.track_id[beside])) == 1
+    assert len(np.unique(found.track_id[at_rest])) == 1
+    assert 0 < found.track_id[beside][0] != found.track_id[at_rest][0]
+
+
+def test_single_faults_begin_no_track(rng):
+    time = 4.0 * np.arange(60)
+    xy = np.column_stack([100.0 * time, np.zeros(60)])
+    wrong = np.arange(10, 60, 7)
+    xy[wrong, 1] += rng.choice([-1.0, 1.0], len(wrong)) * rng.uniform(350.0, 600.0, len(wrong))
+    far = measured(time, np.full((60, 2), 300e3), 5.0)  # the region is large
+    near = measured(time, xy + 5.0 * rng.standard_normal(xy.shape), 5.0)
+    m = both(near, far)
+    found = run(m)
+    assert len(found.raw.confirmed) == 2
+    mine = found.rows.measurement[found.rows.p_fault > 0.5]
+    np.testing.assert_array_equal(np.sort(m.time[mine]), time[wrong])
+
+
+def both(a, b):
+    """Measurements of two sets, in time order."""
+    columns = {f.name: np.concatenate([getattr(a, f.name), getattr(b, f.name)]) for f in fields(a)}
+    columns["plot"] = np.arange(len(a) + len(b))
+    return replace(a, **columns).take(np.argsort(columns["time"], kind="stable"))
 
 
 def test_spells_of_a_degraded_source():

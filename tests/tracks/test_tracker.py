@@ -233,6 +233,19 @@ def test_a_start_from_two_radars_at_nearly_one_time(rng):
     assert speed.max() < 1500.0
 
 
+def test_a_target_that_reports_seldom_gets_a_track(rng):
+    """One is seen twice a second, the other every five seconds: for its source a wait of five seconds is no miss."""
+    often, seldom = 0.5 * np.arange(160), 0.2 + 5.0 * np.arange(16)
+    time, xy = np.concatenate([often, seldom]), np.zeros((176, 2))
+    xy[:160, 0], xy[160:, 0] = 50.0 * often, -20e3
+    m = measured(time, xy + 5.0 * rng.standard_normal(xy.shape), 5.0)
+    parked = m.position[:, 0] < -10e3
+    found = run(m, periods=(0.5,), waits=(5.0,))
+    assert len(np.unique(found.track_id[parked])) == 1 and found.track_id[parked][0] > 0
+    assert len(np.unique(found.track_id[~parked])) == 1
+    assert not run(m, periods=(0.5,)).track_id[parked].any()
+
+
 def scene(rng, seconds=160.0):
     """Eight aircraft, two of them turning, seen by two radars with misses and clutter."""
     way = [

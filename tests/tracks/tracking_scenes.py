@@ -82,9 +82,10 @@ def observed(seen, radars, noise, plane, codes=None, height_prior=(5000.0, 3500.
     return m, label[order]
 
 
-def run(m, *, settings=None, filters=None, periods=(4.0,), identity=True):
+def run(m, *, settings=None, filters=None, periods=(4.0,), identity=True, waits=None):
     parts = []
-    tracker = Tracker(settings or TrackerSettings(), filters or FilterSettings(), periods, use_identity=identity)
+    settings, filters = settings or TrackerSettings(), filters or FilterSettings()
+    tracker = Tracker(settings, filters, periods, use_identity=identity, waits=waits)
     raw = tracker.run(m, parts.append)
     rows = join_rows(parts)
     good = np.flatnonzero(np.isin(rows.track_id, raw.confirmed))

@@ -36,6 +36,7 @@ __all__ = ["parse_time", "track_files", "track_recording"]
 
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 _DAY = 86400.0  # s
+_ADSB, _PARKED = 21, 5.0  # s: category, and how seldom a transponder at rest on the ground tells its position
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
 
 
@@ -215,7 +216,7 @@ def _nothing_left(plots: Plots, problems: Sequence[str]) -> str:
 def _sensors(sources: Sequence[Source], recording: Recording, config: Config) -> Sensors:
     sites: list[Site | None] = []
     configured: list[dict[str, float]] = []
-    periods, told_periods, names, told_systems = [], [], [], []
+    periods, waits, told_periods, names, told_systems = [], [], [], [], []
     for source in sources:
         sensor = config.site_for(source.system)
         sites.append(None if sensor is None else _site(sensor))
@@ -224,10 +225,11 @@ def _sensors(sources: Sequence[Source], recording: Recording, config: Config) ->
         given = None if sensor is None else sensor.period
         told_periods.append(given or (float(np.median(told)) if told else np.nan))
         periods.append(_NO_PERIOD if np.isnan(told_periods[-1]) else told_periods[-1])
+        waits.append(max(periods[-1], _PARKED if source.system.category == _ADSB else 0.0))
         configured.append({} if sensor is None else _noise(sensor, periods[-1]))
         names.append(sensor.name if sensor is not None and sensor.name else str(source.system))
         told_systems.append("" if sensor is None else sensor.system)
-    return Sensors(sites, configured, periods, told_periods, names, told_systems)
+    return Sensors(sites, configured, periods, waits, told_periods, names, told_systems)
 
 
 def _site(sensor: SensorConfig) -> Site | None:

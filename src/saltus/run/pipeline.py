@@ -140,7 +140,7 @@ def _joined(
         [lasting_difference(a, b) for a in whole.registered for b in whole.registered if a is not b], default=0.0
     )
     found = track_systems(
-        parts, whole.segments, lasting, config.filter, config.tracker, sensors.periods, use_identity=use_identity
+        parts, whole.segments, lasting, config.filter, config.tracker, sensors.waits, use_identity=use_identity
     )
     noise, estimates = dict(tracked[0].noise), dict(tracked[0].estimates)
     for party, t in zip(parties, tracked, strict=True):

@@ -43,7 +43,9 @@ def track_system(
         part: Plots, label: str, settings: TrackerSettings
     ) -> tuple[list[Rows], Measurements, Assignments, dict[int, NoiseEstimate]]:
         m = place_plots(part, plane, sensors.sites, noise, settings.height_prior)
-        tracker = Tracker(settings, config.filter, sensors.periods, use_identity=use_identity)
+        tracker = Tracker(
+            settings, config.filter, sensors.periods, use_identity=use_identity, waits=sensors.waits
+        )
         rows: list[Rows] = []
         found = tracker.run(m, rows.append, lambda share: bar.working(label, share))
         kept = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)

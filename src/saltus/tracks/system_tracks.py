@@ -79,7 +79,7 @@ def track_systems(
         lasting: standard deviation of what lasts between systems, m: added where systems meet in a track.
         filters: manoeuvres.
         settings: faults, coasting.
-        periods: update period of each source, s.
+        periods: s without a report after which a target counts as missed, of each source.
         use_identity: whether tracks take over addresses and codes.
     """
     m, place = _merged(parts)

@@ -93,6 +93,7 @@ class Tracker:
         periods: Sequence[float],
         *,
         use_identity: bool,
+        waits: Sequence[float] | None = None,
     ) -> None:
         """Prepare an empty tracker.
 
@@ -101,9 +102,12 @@ class Tracker:
             filters: the filters of every track.
             periods: update period of each source, s.
             use_identity: let Mode S addresses decide and Mode 3/A codes support the association.
+            waits: s between two reports of a target that each source leaves waiting longest, before one counts as
+                missed; the update periods if not given.
         """
         self._settings = settings
         self._periods = np.asarray(periods, float)
+        self._waits = self._periods if waits is None else np.asarray(waits, float)
         self._use_identity = use_identity
         self._kinematics = make_kinematics(filters)
         self._life = Lifecycle(settings)
@@ -141,7 +145,7 @@ class Tracker:
                 own, period = begin + np.flatnonzero(sources == s), float(self._periods[s])
                 speed = self._settings.max_speed
                 for scan in rounds(measurements, own, period, speed, use_identity=self._use_identity):
-                    self._scan(scan, period)
+                    self._scan(scan, float(self._waits[s]))
             if progress is not None:
                 progress(end / len(measurements))
         confirmed = np.concatenate([np.zeros(0, np.int64), *self._confirmed])
@@ -170,7 +174,7 @@ class Tracker:
             self._kinematics.remove(ended)
             life.end(ended)
 
-    def _scan(self, index: _Index, period: float) -> None:
+    def _scan(self, index: _Index, wait: float) -> None:
         """Associate and absorb the plots of one source in one slice."""
         life = self._life
         bearings = np.isfinite(self._m.bearing[index])
@@ -196,14 +200,17 @@ class Tracker:
         new = again | (life.status[rows] == SEED)
         self._start(rows[new], plots[new])
         self._update(rows[~new], gated, chosen[~new], weights[~new], p[~new])
-        self._enter(rows, plots, period, gated.height_used[chosen], sound=new | (wrong <= 0.5))
+        self._enter(rows, plots, wait, gated.height_used[chosen], sound=new | (wrong <= 0.5))
         life.p_fault[rows] = np.where(new, np.nan, wrong)
         # Neither a start nor a fault, nor a degraded source, says whether the filter's innovations are what it thinks.
         d2 = np.where(new | (wrong > 0.5) | source.degraded, np.nan, gated.d2[chosen])
         self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2, np.where(new, 0, fault))
         left = np.ones(len(index), bool)
         left[gated.pairs.plot[chosen]] = False
-        self._begin(index[left], plots[life.status[rows] == CONFIRMED], period)
+        used = plots[life.status[rows] == CONFIRMED]
+        self._begin(index[left], used, wait)
+        far = np.linalg.norm(m.position[plots, :2] - gated.centre[chosen], axis=-1) > self._settings.split_range
+        self._also_begin(plots[~new & (wrong > 0.5) & far], used, wait)
 
     def _twice_wrong(self, rows: _Index, plots: _Index, wrong: _Array) -> npt.NDArray[np.bool_]:
         """Say which tracks have begun wrongly: tentative ones with two faulty plots in a row.
@@ -284,37 +291,53 @@ class Tracker:
         self,
         rows: _Index,
         plots: _Index,
-        period: float,
+        wait: float,
         height_used: npt.NDArray[np.bool_],
         sound: npt.NDArray[np.bool_],
     ) -> None:
         """Note plots, codes and status of the rows updated; what is not sound confirms no track."""
         life = self._life
         fresh = life.status[rows] != CONFIRMED
-        life.hit(rows, self._m.time[plots], np.full(len(rows), period), plots, sound)
+        life.hit(rows, self._m.time[plots], np.full(len(rows), wait), plots, sound)
         life.has_altitude[rows] |= height_used
         self._note_codes(rows, plots)
         self._track_id[plots] = life.id[rows]
         self._confirmed.append(life.id[rows[fresh & (life.status[rows] == CONFIRMED)]])
 
-    def _begin(self, plots: _Index, used: _Index, period: float) -> None:
+    def _begin(self, plots: _Index, used: _Index, wait: float) -> None:
         """Mark plots left over that are split or contradict their address; begin a track with every other one."""
-        m, life, settings = self._m, self._life, self._settings
-        if not len(plots):
-            return
-        split = m.split_from(plots, used, settings.split_range, np.radians(settings.split_azimuth))
-        elsewhere = life.holds(m.icao24[plots]) & self._use_identity & ~split
+        split = self._split_from(plots, used)
+        elsewhere = self._life.holds(self._m.icao24[plots]) & self._use_identity & ~split
         self._split[plots[split]], self._elsewhere[plots[elsewhere]] = True, True
         plots = plots[~split & ~elsewhere]
+        rows = self._seed(plots, wait)
+        self._track_id[plots] = self._life.id[rows]
+
+    def _also_begin(self, plots: _Index, used: _Index, wait: float) -> None:
+        """Begin tracks with plots that others took as faulty: they may be right ones of a target not yet known.
+
+        They stay with the track that took them. An address settles whose a plot is.
+        """
+        if self._use_identity:
+            plots = plots[self._m.icao24[plots] < 0]
+        self._seed(plots[~self._split_from(plots, np.setdiff1d(used, plots))], wait)
+
+    def _split_from(self, plots: _Index, used: _Index) -> npt.NDArray[np.bool_]:
+        settings = self._settings
+        return self._m.split_from(plots, used, settings.split_range, np.radians(settings.split_azimuth))
+
+    def _seed(self, plots: _Index, wait: float) -> _Index:
+        """Begin a track with every plot."""
+        m, life, settings = self._m, self._life, self._settings
         mean, cov = np.zeros((len(plots), 6)), np.zeros((len(plots), 6, 6))
         mean[:, 0::2], cov[:, 0::2, 0::2] = m.with_height(plots, settings.height_prior)
         cov[:, [1, 3], [1, 3]] = self._seed_speed**2
         cov[:, 5, 5] = _CLIMB**2
         rows = self._kinematics.add(Start(mean, cov))
-        life.begin(rows, Birth(m.time[plots], np.full(len(plots), period), plots, mean, cov))
+        life.begin(rows, Birth(m.time[plots], np.full(len(plots), wait), plots, mean, cov))
         life.has_altitude[rows] = np.isfinite(m.position[plots, 2])
         self._note_codes(rows, plots)
-        self._track_id[plots] = life.id[rows]
+        return rows
 
     def _note_codes(self, rows: _Index, plots: _Index) -> None:
         if self._use_identity:
