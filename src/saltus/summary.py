@@ -16,7 +16,7 @@ from saltus.records import Kind, Plots
 from saltus.tracks.health import Health, sensor_health
 from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
-from saltus.tracks.tracker import Assignments, Rows, join_rows
+from saltus.tracks.rows import Assignments, Rows, join_rows
 
 __all__ = ["SIGMAS", "Sensors", "Tracked", "health_of", "noise_rows", "reported_kind", "show_summary", "summarise"]
 

@@ -10,9 +10,10 @@ from saltus.records import Kind, Plots, Source, System
 from saltus.tracks.kinematics import Start, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Noise, place_plots
+from saltus.tracks.rows import join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.sights import sight
-from saltus.tracks.tracker import Tracker, join_rows
+from saltus.tracks.tracker import Tracker
 
 LATITUDE, LONGITUDE = np.radians([63.4, 10.4])
 PLANE = Plane(float(LATITUDE), float(LONGITUDE))

@@ -7,8 +7,9 @@ import numpy as np
 from saltus.geo import Site
 from saltus.records import Kind, Plots, Source, System
 from saltus.tracks.measurements import Measurements, Noise, place_plots
+from saltus.tracks.rows import join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
-from saltus.tracks.tracker import Tracker, join_rows
+from saltus.tracks.tracker import Tracker
 
 __all__ = ["SITE", "Tracked", "flights", "measured", "observed", "polar_noise", "run"]
 

@@ -30,7 +30,7 @@ from saltus.run.identified import (
 from saltus.run.pipeline import Identified, track_plots
 from saltus.summary import Sensors, Tracked, health_of, noise_rows, show_summary, summarise
 from saltus.tracks.output import assignment_table, innovation_table, track_table
-from saltus.tracks.tracker import Rows, join_rows
+from saltus.tracks.rows import Rows, join_rows
 
 __all__ = ["parse_time", "track_files", "track_recording"]
 

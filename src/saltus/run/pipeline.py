@@ -17,9 +17,9 @@ from saltus.tracks.identities import identify
 from saltus.tracks.local import LocalSystem, Party, foreign_systems, group_sources, local_system
 from saltus.tracks.measurements import make_plane
 from saltus.tracks.membership import Segments, segments
+from saltus.tracks.rows import join_rows
 from saltus.tracks.system_tracks import Part, track_systems
 from saltus.tracks.systems import Registered, lasting_difference, register_all
-from saltus.tracks.tracker import join_rows
 
 __all__ = ["Identified", "track_plots"]
 

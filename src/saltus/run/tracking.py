@@ -13,8 +13,9 @@ from saltus.records import Plots
 from saltus.summary import SIGMAS, Sensors, Tracked, reported_kind
 from saltus.tracks.measurements import Measurements, default_noise, place_plots
 from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
+from saltus.tracks.rows import Assignments, Rows, join_rows
 from saltus.tracks.settings import TrackerSettings
-from saltus.tracks.tracker import Assignments, Rows, Tracker, join_rows
+from saltus.tracks.tracker import Tracker
 
 __all__ = ["track_system"]
 
@@ -43,9 +44,7 @@ def track_system(
         part: Plots, label: str, settings: TrackerSettings
     ) -> tuple[list[Rows], Measurements, Assignments, dict[int, NoiseEstimate]]:
         m = place_plots(part, plane, sensors.sites, noise, settings.height_prior)
-        tracker = Tracker(
-            settings, config.filter, sensors.periods, use_identity=use_identity, waits=sensors.waits
-        )
+        tracker = Tracker(settings, config.filter, sensors.periods, use_identity=use_identity, waits=sensors.waits)
         rows: list[Rows] = []
         found = tracker.run(m, rows.append, lambda share: bar.working(label, share))
         kept = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)

@@ -13,7 +13,7 @@ from saltus.geo import Plane
 from saltus.identify import LocalTracks
 from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.measurements import Measurements
-from saltus.tracks.tracker import Assignments, Rows
+from saltus.tracks.rows import Assignments, Rows
 
 __all__ = ["LocalSystem", "Party", "foreign_systems", "group_sources", "local_system"]
 

@@ -10,7 +10,7 @@ from saltus.geo import Plane
 from saltus.records import REASONS, Plots
 from saltus.tracks.lifecycle import STATUS
 from saltus.tracks.measurements import Measurements
-from saltus.tracks.tracker import Assignments, Rows
+from saltus.tracks.rows import Assignments, Rows
 
 __all__ = [
     "BEARING",

@@ -16,9 +16,9 @@ from saltus.tracks.lifecycle import COASTED, CONFIRMED, TENTATIVE
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.membership import Segments
+from saltus.tracks.rows import Assignments, Rows, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.systems import Registered
-from saltus.tracks.tracker import Assignments, Rows, join_rows
 
 __all__ = ["Part", "SystemTracking", "track_systems"]
 

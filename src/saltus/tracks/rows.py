@@ -1,0 +1,68 @@
+"""What the tracker gives: published rows, and what became of each measurement."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.tracks.faults import SourceCondition
+from saltus.tracks.kinematics import Moments
+
+__all__ = ["Assignments", "Rows", "join_rows"]
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.intp]
+
+
+class Rows(NamedTuple):
+    """Published track rows, one array element each, in the tracker's plane."""
+
+    track_id: npt.NDArray[np.int64]
+    time: _Array
+    moments: Moments
+    status: npt.NDArray[np.int8]  # index into lifecycle.STATUS
+    has_altitude: npt.NDArray[np.bool_]
+    icao24: npt.NDArray[np.int32]
+    mode3a: npt.NDArray[np.int16]
+    named: _Index  # measurement that gave the callsign, -1 none
+    measurement: _Index  # measurement of the update, -1 where coasted
+    centre: _Array  # (k, 2): centre of the gate
+    gate_cov: _Array  # (k, 2, 2): innovation covariance
+    d2: _Array  # squared Mahalanobis distance of the horizontal innovation; NaN where there is none
+    p_fault: _Array  # probability that the track's last plot was faulty; NaN where nothing told
+    fault: npt.NDArray[np.int8]  # likeliest fault of the measurement: 1 + component of its source's; 0 without one
+
+
+def join_rows(parts: Sequence[Rows]) -> Rows:
+    """Join rows published at different times; no part gives no rows."""
+    nothing = Rows(
+        np.zeros(0, np.int64),
+        np.zeros(0),
+        Moments(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros(0), np.zeros(0)),
+        np.zeros(0, np.int8),
+        np.zeros(0, bool),
+        np.zeros(0, np.int32),
+        np.zeros(0, np.int16),
+        np.zeros(0, np.intp),
+        np.zeros(0, np.intp),
+        np.zeros((0, 2)),
+        np.zeros((0, 2, 2)),
+        np.zeros(0),
+        np.zeros(0),
+        np.zeros(0, np.int8),
+    )
+    parts = [nothing, *parts]
+    moments = Moments(*(np.concatenate(column) for column in zip(*(p.moments for p in parts), strict=True)))
+    columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Rows._fields if name != "moments"}
+    return Rows(moments=moments, **columns)
+
+
+class Assignments(NamedTuple):
+    """What became of each measurement."""
+
+    track_id: npt.NDArray[np.int64]  # (N,), 0 = none
+    split: npt.NDArray[np.bool_]  # (N,): a second plot of a target already updated
+    elsewhere: npt.NDArray[np.bool_]  # (N,): far from the track that has its address
+    confirmed: npt.NDArray[np.int64]  # ids of the tracks that were confirmed at some time
+    sources: Sequence[SourceCondition]  # what was found of the condition of each source
