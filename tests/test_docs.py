@@ -103,7 +103,7 @@ def test_columns_explained_are_the_columns_written(tmp_path, monkeypatch, capsys
     for source in blocks("quickstart.md", "python"):
         exec(compile(source, "quickstart.md", "exec"), names)
     capsys.readouterr()
-    for file in ("tracks", "assignments"):
+    for file in ("tracks", "assignments", "identifications"):
         section = TEXT["formats.md"].partition(f"### `{file}.parquet`")[2].partition("\n### ")[0]
         explained = cells(section)
         written = parquet.read_schema(tmp_path / "out" / f"{file}.parquet")
