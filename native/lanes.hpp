@@ -33,9 +33,13 @@ SALTUS_INLINE V minimum(V a, V b) { return a < b ? a : b; }
 SALTUS_INLINE V maximum(V a, V b) { return a > b ? a : b; }
 
 SALTUS_INLINE bool any(I mask) {
+#if defined(__AVX512F__)
+  return __builtin_ia32_ptestmq512(mask, mask, -1) != 0;
+#else
   long long all = 0;
   for (int l = 0; l < W; ++l) all |= mask[l];
   return all != 0;
+#endif
 }
 
 // 1 / a for normal a, to the last bit or two. Where the machine guesses it to 2^-14, two Newton steps, which double the
@@ -50,13 +54,11 @@ SALTUS_INLINE V reciprocal(V a) {
 #endif
 }
 
-// For a >= 0, zero and normal, likewise.
+// For normal a, likewise: a y (1 - e)^(-1/2) with a guess y of a^(-1/2) and e = 1 - a y^2 below 2^-13, to e^3.
 SALTUS_INLINE V square_root(V a) {
 #if defined(__AVX512F__)
-  V y = __builtin_ia32_rsqrt14pd512_mask(a, V{}, -1), half = 0.5 * a;
-  y += y * (0.5 - half * y * y);
-  const V root = a * y;
-  return select(a == 0.0, a, root + 0.5 * y * (a - root * root));
+  const V y = __builtin_ia32_rsqrt14pd512_mask(a, V{}, -1), root = a * y, e = 1.0 - root * y;
+  return root + root * (e * ((0.3125 * e + 0.375) * e + 0.5));
 #elif defined(__AVX__)
   return __builtin_ia32_sqrtpd256(a);
 #else

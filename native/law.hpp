@@ -23,23 +23,25 @@ inline void into_logs(V* law, int modes) {
   for (int j = 0; j < modes; ++j) law[j] = logarithm(law[j]);
 }
 
-// Bayes' rule with every number of a moderate size; false, and nothing changed, when some lane needs logs.
-inline bool reweigh_linear(V* law, int modes, int size, const V* report, V seen, V* heap, V& evidence) {
-  const V never = splat(__builtin_inf());
-  V least = never;
-  for (int j = 0; j < modes; ++j) least = minimum(select(law[j] > 0.0, report[j * size], never), least);
-  V sum{}, weakest = never;
-  for (int j = 0; j < modes; ++j) {
+// Bayes' rule with every number of a moderate size; false, and nothing changed, when some lane needs logs. MODES is
+// their number when known to the compiler, 0 otherwise.
+template <int MODES>
+inline bool reweigh_linear(V* law, int size_modes, int size, const V* report, V seen, V* heap, V& evidence) {
+  const int modes = MODES > 0 ? MODES : size_modes;
+  Local<MODES> joint(heap, modes);
+  V least = report[0];
+  from<MODES>(1, modes, [&](int j) SALTUS_LAMBDA { least = minimum(report[j * size], least); });
+  V sum{}, weakest = splat(__builtin_inf());
+  each<MODES>(modes, [&](int j) SALTUS_LAMBDA {
     const V* r = report + j * size;
-    const V joint = law[j] * square_root(r[1]) * exponential(minimum(-0.5 * (r[0] - least), V{}));
-    weakest = minimum(select(law[j] > 0.0, joint, never), weakest);
-    sum += joint;
-    heap[j] = joint;
-  }
+    joint[j] = law[j] * square_root(r[1]) * exponential(-0.5 * (r[0] - least));
+    weakest = select(law[j] > 0.0, minimum(joint[j], weakest), weakest);
+    sum += joint[j];
+  });
   const I safe = (sum > 1e-250) & (sum < 1e250) & (weakest >= sum * 1e-200);
   if (any(~safe)) return false;
   const V scale = reciprocal(sum);
-  for (int j = 0; j < modes; ++j) law[j] = heap[j] * scale;
+  each<MODES>(modes, [&](int j) SALTUS_LAMBDA { law[j] = joint[j] * scale; });
   if (modes == 1) law[0] = splat(1.0);  // not to the last bit: exactly
   evidence = logarithm(sum) - 0.5 * (least + seen * kLog2Pi);
   return true;
@@ -64,7 +66,8 @@ inline V reweigh_logs(V* law, int modes, int m, const V* report, V seen) {
 // law <- P(modes | z), returns log f(z): 0 where nothing was seen. `heap` holds one number per mode.
 inline V reweigh(V* law, bool& logs, int modes, int m, const V* report, V seen, V* heap) {
   V evidence;
-  if (logs || !reweigh_linear(law, modes, report_size(m), report, seen, heap, evidence)) {
+  const auto linear = modes == 2 ? reweigh_linear<2> : modes == 4 ? reweigh_linear<4> : reweigh_linear<0>;
+  if (logs || !linear(law, modes, report_size(m), report, seen, heap, evidence)) {
     if (!logs) into_logs(law, modes);
     logs = true;
     evidence = reweigh_logs(law, modes, m, report, seen);

@@ -23,51 +23,23 @@ class Recursion {
 
   std::size_t used() const { return used_; }
 
-  // The stages of step k, in this order, for the block that `begin` named.
-  void begin(Size block) {
-    first = block * W;
-    tracks = p.n_tracks - first < W ? int(p.n_tracks - first) : W;
-    load_prior();
-  }
-
-  void predict(Size k) {
-    if (k % W == 0) load_measurements(k);
-    read_measurement(k);
-    if (k >= p.start) mix(k - p.start);
-  }
-
-  void update(Size k) {
-    const Size moved = k - p.start;  // the row of the dynamics; none where the prior holds at the first measurement
-    I bad;
-    if (p.known && moved >= 0) {
-      if (n < p.n && !complete) widen();
-      bad = advance(moved);
-    } else {
-      if (moved >= 0) propagate(moved);
-      bad = measure(k);
-      if (p.known) full.shared.propagate(state, n, p.modes, shared(p.map, 0), {}, {nothing, none, 0}, heap);
+  int run(Size first_block, Size last_block) {
+    for (Size block = first_block; block < last_block; ++block) {
+      first = block * W;
+      tracks = p.n_tracks - first < W ? int(p.n_tracks - first) : W;
+      load_prior();
+      for (Size k = 0; k < p.n_steps; ++k) {
+        if (k % W == 0) load_measurements(k);
+        read_measurement(k);
+        if (k >= p.start) mix(k - p.start);
+        update(k);
+        weigh(k);
+        if (p.every || k == p.n_steps - 1) collapse(output.slot(k));
+        output.store(state, n, first, tracks, k);
+      }
     }
-    if (p.known) settle();
-    if (any(bad)) status |= kNotPositive;
+    return status;
   }
-
-  void weigh(Size k) {
-    const bool keep = p.every || k == p.n_steps - 1;
-    V* out = output.slot(k);
-    output.n_observed(out) = seen;
-    if (keep) {
-      probabilities(law, logs, p.modes, probs);
-      output.nis(out) = full.nis(report, probs, m, p.modes, heap);
-    }
-    output.log_likelihood(out) = reweigh(law, logs, p.modes, m, report, seen, heap);
-  }
-
-  void keep(Size k) {
-    if (p.every || k == p.n_steps - 1) collapse(output.slot(k));
-    output.store(state, n, first, tracks, k);
-  }
-
-  int status = kFine;
 
  private:
   void divide(Arena& arena) {
@@ -196,6 +168,32 @@ class Recursion {
     return full.shared.update(state, n, m, p.modes, shared(p.H, k), shared(p.d, k), shared(p.R, k), z, on, report, heap);
   }
 
+  void update(Size k) {
+    const Size moved = k - p.start;  // the row of the dynamics; none where the prior holds at the first measurement
+    I bad;
+    if (p.known && moved >= 0) {
+      if (n < p.n && !complete) widen();
+      bad = advance(moved);
+    } else {
+      if (moved >= 0) propagate(moved);
+      bad = measure(k);
+      if (p.known) full.shared.propagate(state, n, p.modes, shared(p.map, 0), {}, {nothing, none, 0}, heap);
+    }
+    if (p.known) settle();
+    if (any(bad)) status |= kNotPositive;
+  }
+
+  void weigh(Size k) {
+    const bool keep = p.every || k == p.n_steps - 1;
+    V* out = output.slot(k);
+    output.n_observed(out) = seen;
+    if (keep) {
+      probabilities(law, logs, p.modes, probs);
+      output.nis(out) = full.nis(report, probs, m, p.modes, heap);
+    }
+    output.log_likelihood(out) = reweigh(law, logs, p.modes, m, report, seen, heap);
+  }
+
   // What is measured are the last components of the state: take them back in, as known as the last row left them.
   void widen() {
     const int kept = n, size = record_size(p.n);
@@ -248,28 +246,12 @@ class Recursion {
   Size first = 0;
   int tracks = W, n = 0;  // n components are in the records now
   std::size_t used_ = 0;
+  int status = kFine;
   bool logs = true, complete = false;
   V seen{};
   V *heap, *state, *moments, *law, *probs, *report, *z_raw, *z, *known, *on, *F, *b, *Q, *H, *d, *R, *prior, *trans;
   double* nothing = nullptr;  // a covariance of zero, in every mode
   int* none = nullptr;
 };
-
-// Two blocks take turns, stage by stage: one's arithmetic fills the gaps that the other's chain of results leaves.
-inline int run(const Problem& p, Size first_block, Size last_block, Arena arena) {
-  Recursion one(p, arena), other(p, {arena.base + one.used()});
-  for (Size block = first_block; block < last_block; block += 2) {
-    Recursion* const pair[2] = {&one, &other};
-    const int blocks = last_block - block > 1 ? 2 : 1;
-    for (int i = 0; i < blocks; ++i) pair[i]->begin(block + i);
-    for (Size k = 0; k < p.n_steps; ++k) {
-      for (int i = 0; i < blocks; ++i) pair[i]->predict(k);
-      for (int i = 0; i < blocks; ++i) pair[i]->update(k);
-      for (int i = 0; i < blocks; ++i) pair[i]->weigh(k);
-      for (int i = 0; i < blocks; ++i) pair[i]->keep(k);
-    }
-  }
-  return one.status | other.status;
-}
 
 }  // namespace saltus::SALTUS_NS

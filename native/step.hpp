@@ -109,17 +109,17 @@ SALTUS_INLINE void mixing_weights(V* law, int stride, int size, const E* trans, 
 }
 
 // The same for a fibre of two modes, kept in registers.
-template <class E>
-SALTUS_INLINE void pair_weights(V& a, V& b, const E* trans, bool logs, V (&mu)[4]) {
+template <class E, bool Logs>
+SALTUS_INLINE void pair_weights(V& a, V& b, const E* trans, V (&mu)[4]) {
   V top{}, p = a, q = b;
-  if (logs) {
+  if constexpr (Logs) {
     top = maximum(a, b);
     top = select(top > -1e300, top, V{});
     p = exponential(p - top), q = exponential(q - top);
   }
   const V p0 = p * trans[0], p1 = p * trans[1], q0 = q * trans[2], q1 = q * trans[3];
   a = p0 + q0, b = p1 + q1;
-  if (logs) a = logarithm(a) + top, b = logarithm(b) + top;
+  if constexpr (Logs) a = logarithm(a) + top, b = logarithm(b) + top;
   const V x0 = p0 + kFloor, x1 = p1 + kFloor, y0 = q0 + kFloor, y1 = q1 + kFloor;
   const V first = reciprocal(x0 + y0), second = reciprocal(x1 + y1);
   mu[0] = x0 * first, mu[1] = x1 * second, mu[2] = y0 * first, mu[3] = y1 * second;
@@ -181,24 +181,32 @@ SALTUS_INLINE void mix_fibre(V* first, long stride, int size, const V* mu, int n
   }
 }
 
+// One chain of two modes. Apart from logs, whose constants would fill the registers of the loop.
+template <int N, class E, bool Logs>
+__attribute__((noinline)) void mix_pairs(V* state, V* law, int size_n, int outer, int inner, const E* trans, V* heap) {
+  const int n = N > 0 ? N : size_n;
+  const long record = n + triangle(n), step = inner * record;
+  for (int o = 0; o < outer; ++o, state += step, law += inner)
+    for (int i = 0; i < inner; ++i, state += record, ++law) {
+      V mu[4];
+      pair_weights<E, Logs>(law[0], law[inner], trans, mu);
+      mix_pair<N>(state, state + step, mu, n, heap);
+    }
+}
+
 // One chain: modes are outer x size x inner, the middle axis is mixed. `law` is P(modes), or its logarithm.
 template <int N, class E>
 void mix(V* state, V* law, int size_n, int outer, int size, int inner, const E* trans, bool logs, V* heap) {
+  if (size == 2)
+    return (logs ? mix_pairs<N, E, true> : mix_pairs<N, E, false>)(state, law, size_n, outer, inner, trans, heap);
   const int n = N > 0 ? N : size_n;
   const long record = n + triangle(n);
   for (int o = 0; o < outer; ++o)
     for (int i = 0; i < inner; ++i) {
       const int at = o * size * inner + i;
-      V* first = state + at * record;
-      if (size == 2) {
-        V mu[4];
-        pair_weights(law[at], law[at + inner], trans, logs, mu);
-        mix_pair<N>(first, first + inner * record, mu, n, heap);
-      } else {
-        V* mu = heap;
-        mixing_weights(law + at, inner, size, trans, logs, mu);
-        mix_fibre<N>(first, inner * record, size, mu, n, heap + size * size + size);
-      }
+      V* mu = heap;
+      mixing_weights(law + at, inner, size, trans, logs, mu);
+      mix_fibre<N>(state + at * record, inner * record, size, mu, n, heap + size * size + size);
     }
 }
 

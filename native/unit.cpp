@@ -10,10 +10,10 @@ namespace {
 
 Arena arena(double* workspace) { return {reinterpret_cast<V*>(workspace), 0}; }
 
-std::size_t filter_workspace(const Problem& p) { return 2 * Recursion(p, {}).used() * W; }
+std::size_t filter_workspace(const Problem& p) { return Recursion(p, {}).used() * W; }
 
 int filter(const Problem& p, Size first_block, Size last_block, double* workspace) {
-  return run(p, first_block, last_block, arena(workspace));
+  return Recursion(p, arena(workspace)).run(first_block, last_block);
 }
 
 std::size_t bank_workspace(const Tracks& t, int m) {

@@ -380,6 +380,9 @@ def plain(rng):
         ({"noise_cov0": -np.eye(1)}, "noise_cov0 must be positive semi-definite"),
         ({"trans": [np.array([[0.9, 0.2], [0.1, 0.9]])]}, "rows must be probabilities"),
         ({"probs0": np.array([0.5, 0.6])}, "sum to 1"),
+        ({"dt": -0.5}, "dt must not be negative, got -0.5 s"),
+        ({"dt": np.array([1.0, 1.0, 1.0, -2.0])}, "dt must not be negative, got -2 s"),
+        ({"dt": np.nan}, "dt is nan; give a finite number"),
     ],
 )
 def test_wrong_descriptions_are_refused(plain, change, message):
@@ -425,7 +428,7 @@ def test_no_threads_are_refused(plain, way):
 def test_two_samples_at_one_time_are_refused_and_two_components_are_not(rng, backend):
     p = random_coloured(rng, (2,), 2, 2, 2, missing=0.0)
     p["dt"] = np.array([0.5, 0.0])
-    with pytest.raises(NumericalError, match="Two samples at one time"):
+    with pytest.raises(NumericalError, match=r"Component 0 gets no noise in the interval before row 2. Two samples"):
         coloured_filter(**p, backend=backend)
     p["z"][1, 1] = p["z"][2, 0] = np.nan
     P = random_trans(rng, 2)

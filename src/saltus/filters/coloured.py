@@ -4,7 +4,7 @@ Both take arrays, begin with the first sample, take gaps, and give the same post
 `saltus.filters.differencing` or its compiled twin; augmentation is `imm_filter` on the state with the noise's own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -14,8 +14,8 @@ import numpy.typing as npt
 from saltus.errors import NumericalError
 from saltus.filters.align import Aligned
 from saltus.filters.backend import Backend, check_settings, fits_kernel, use_native
-from saltus.filters.coloured_model import Augmented, augment, difference, factored
-from saltus.filters.differencing import NO_NOISE, aligned_samples, filter_differenced, measured, read, start
+from saltus.filters.coloured_model import Augmented, Differenced, augment, difference, factored
+from saltus.filters.differencing import aligned_samples, filter_differenced, known_exactly, measured, read, start
 from saltus.filters.estimates import Estimates
 from saltus.filters.imm import imm_filter
 
@@ -217,23 +217,33 @@ def run_differenced(
     def aligned(defer: bool) -> Aligned:
         return aligned_samples(whole, differenced, trans, probs0, None, defer=defer)
 
-    if _runs_native(whole, model, trans, keep, backend, num_threads):
-        from saltus.filters.native import Run, filter_native
+    try:
+        if _runs_native(whole, model, trans, keep, backend, num_threads):
+            return _differenced_native(whole, aligned, model, moves, (per_mode, keep == "all", num_threads, n))
+        data = read(whole, aligned(False))
+        steps = moves._replace(Phi=data.aligned.F, B=data.aligned.Q, b=data.aligned.b)
+        return filter_differenced(data, steps, n, per_mode=per_mode, every=keep == "all")
+    except NumericalError as error:
+        raise known_exactly(moves.B, whole.shape[-1], len(trans)) from error
 
-        noise = factored(model, moves)
 
-        def in_parts(defer: bool) -> Aligned:
-            whole_noise = aligned(defer)
-            return whole_noise._replace(Q=noise.reshape((1,) * (whole_noise.Q.ndim - noise.ndim) + noise.shape))
+def _differenced_native(
+    z: _Array,
+    aligned: Callable[[bool], Aligned],
+    model: Augmented,
+    moves: Differenced,
+    settings: tuple[bool, bool, int | None, int],
+) -> Estimates:
+    """Run the compiled twin of `filter_differenced`, which takes the noise in parts."""
+    from saltus.filters.native import Run, filter_native
 
-        run = Run(per_mode, keep == "all", num_threads, reported=n, from_first=True, map=moves.T)
-        try:
-            return filter_native(whole, in_parts, run)
-        except NumericalError as error:
-            raise NumericalError(NO_NOISE) from error
-    data = read(whole, aligned(False))
-    moves = moves._replace(Phi=data.aligned.F, B=data.aligned.Q, b=data.aligned.b)
-    return filter_differenced(data, moves, n, per_mode=per_mode, every=keep == "all")
+    noise = factored(model, moves)
+
+    def in_parts(defer: bool) -> Aligned:
+        whole = aligned(defer)
+        return whole._replace(Q=noise.reshape((1,) * (whole.Q.ndim - noise.ndim) + noise.shape))
+
+    return filter_native(z, in_parts, Run(*settings, from_first=True, map=moves.T))
 
 
 def _runs_native(

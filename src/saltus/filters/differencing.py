@@ -18,16 +18,31 @@ from saltus.filters.align import Aligned, align
 from saltus.filters.coloured_model import Augmented, Differenced
 from saltus.filters.estimates import Estimates
 
-__all__ = ["NO_NOISE", "Samples", "aligned_samples", "filter_differenced", "measured", "read", "start"]
+__all__ = ["Samples", "aligned_samples", "filter_differenced", "known_exactly", "measured", "read", "start"]
 
 _Array = npt.NDArray[np.float64]
 _Index = tuple[slice | int, ...]
 
-NO_NOISE = (
-    "an innovation covariance is not positive definite: a measured component repeats what is known exactly. Two "
-    "samples at one time, or noise_G = 0 where the state brings no noise either. Drop the repeated sample, or give "
-    "the noise a diffusion."
-)
+
+def known_exactly(B: _Array, m: int, n_chains: int) -> NumericalError:
+    """The error of a measured component that was known exactly, with the first interval that brings one no noise.
+
+    Args:
+        B: covariance of the noise of s, (T?, M1|1, ..., MC|1, n+p, n+p); its last m components are measured.
+        m: number of measured components.
+        n_chains: C.
+    """
+    none = np.argwhere(np.diagonal(B, axis1=-2, axis2=-1)[..., -m:] <= 0)
+    time, where = B.ndim - n_chains - 3, ""
+    if len(none):
+        timed = time >= 0 and B.shape[time] > 1
+        interval = f"the interval before row {none[0, time] + 1}" if timed else "any interval"
+        where = f" Component {none[0, -1]} gets no noise in {interval}."
+    return NumericalError(
+        "an innovation covariance is not positive definite: a measured component repeats what is known exactly."
+        f"{where} Two samples at one time, or noise_G = 0 where the state brings no noise either. Drop the repeated "
+        "sample, or give the noise a diffusion."
+    )
 
 
 class Samples(NamedTuple):
@@ -108,27 +123,24 @@ def filter_differenced(data: Samples, moves: Differenced, n: int, *, per_mode: b
         Estimates of x with one row per row of z, the first included, or the last row only.
 
     Raises:
-        NumericalError: a measured component was already known exactly.
+        NumericalError: an innovation covariance is not positive definite.
     """
     out, n_rows = _allocate(data, n, per_mode, every), data.z.shape[-2]
     runs = (slice(None),) * (data.z.ndim - 2)
-    try:
-        belief, log_f, d2 = start(data, moves.T[: moves.n_kept] if data.complete[0] else moves.T)
-        belief = _pin(belief, data, 0, moves.n_kept)
-        for k in range(n_rows):
-            if k > 0:
-                belief, log_f, d2 = _step(data, moves, belief, k - 1)
-            out.log_likelihood[..., k] = log_f
-            if not every and k < n_rows - 1:
-                continue
-            at: _Index = (*runs, k if every else 0)
-            out.probs[at], out.nis[at] = np.exp(belief.log_probs), d2
-            means, covs = belief.means[..., :n], belief.covs[..., :n, :n]
-            out.mean[at], out.cov[at] = steps.collapse(belief.log_probs, means, covs, len(data.aligned.trans))
-            if out.mode_means is not None and out.mode_covs is not None:
-                out.mode_means[at], out.mode_covs[at] = means, covs
-    except NumericalError as error:
-        raise NumericalError(NO_NOISE) from error
+    belief, log_f, d2 = start(data, moves.T[: moves.n_kept] if data.complete[0] else moves.T)
+    belief = _pin(belief, data, 0, moves.n_kept)
+    for k in range(n_rows):
+        if k > 0:
+            belief, log_f, d2 = _step(data, moves, belief, k - 1)
+        out.log_likelihood[..., k] = log_f
+        if not every and k < n_rows - 1:
+            continue
+        at: _Index = (*runs, k if every else 0)
+        out.probs[at], out.nis[at] = np.exp(belief.log_probs), d2
+        means, covs = belief.means[..., :n], belief.covs[..., :n, :n]
+        out.mean[at], out.cov[at] = steps.collapse(belief.log_probs, means, covs, len(data.aligned.trans))
+        if out.mode_means is not None and out.mode_covs is not None:
+            out.mode_means[at], out.mode_covs[at] = means, covs
     return out
 
 

@@ -32,7 +32,8 @@ def numbers(value: object, what: str) -> FloatArray:
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
-        raise ModelError(f"{what} holds {array[index]} at index {list(index)}; give a finite number.")
+        found = f"holds {array[index]} at index {list(index)}" if index else f"is {array[index]}"
+        raise ModelError(f"{what} {found}; give a finite number.")
     array.flags.writeable = False
     return array
 
