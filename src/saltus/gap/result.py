@@ -127,7 +127,8 @@ def percent(f: Figure) -> str:
 
 def spread(f: Figure) -> str:
     """A figure with its interval."""
-    return f"{f.value:.4f} ({f.low:.4f} to {f.high:.4f})"
+    digits = ".4f" if abs(f.value) < 1e4 else ".3g"
+    return f"{f.value:{digits}} ({f.low:{digits}} to {f.high:{digits}})"
 
 
 def verdict(gap: Gap, linear: bool) -> str:
