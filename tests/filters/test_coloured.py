@@ -382,7 +382,7 @@ def plain(rng):
         ({"probs0": np.array([0.5, 0.6])}, "sum to 1"),
         ({"dt": -0.5}, "dt must not be negative, got -0.5 s"),
         ({"dt": np.array([1.0, 1.0, 1.0, -2.0])}, "dt must not be negative, got -2 s"),
-        ({"dt": np.nan}, "dt is nan; give a finite number"),
+        ({"dt": np.nan}, "dt holds nan; give a finite number"),
     ],
 )
 def test_wrong_descriptions_are_refused(plain, change, message):

@@ -32,8 +32,8 @@ def numbers(value: object, what: str) -> FloatArray:
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
-        found = f"holds {array[index]} at index {list(index)}" if index else f"is {array[index]}"
-        raise ModelError(f"{what} {found}; give a finite number.")
+        where = f" at index {list(index)}" if index else ""
+        raise ModelError(f"{what} holds {array[index]}{where}; give a finite number.")
     array.flags.writeable = False
     return array
 
