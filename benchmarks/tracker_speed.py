@@ -2,9 +2,9 @@
 
     python benchmarks/tracker_speed.py [RECORDING... --config FILE]
 
-Two simulated radars see the same aircraft, with clutter, and update common tracks; the default filters (eight modes: four
-horizontal, two vertical) and chains of faults, one thread. Recordings are tracked as `saltus track` does. The fastest of three
-runs; of recordings the time includes the estimation of noise and everything after decoding.
+Two simulated radars see the same aircraft, with clutter, and update common tracks; the default filters (eight modes:
+four horizontal, two vertical) and chains of faults, one thread. Recordings are tracked as `saltus track` does. The
+fastest of three runs; of recordings the time includes the estimation of noise and everything after decoding.
 """
 
 import argparse
