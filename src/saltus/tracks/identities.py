@@ -22,6 +22,7 @@ from saltus.linalg import logsumexp
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.settings import SystemsSettings
+from saltus.tracks.splits import split_evidence
 from saltus.tracks.systems import Registered, lasting_difference, pairing_settings, short_difference
 
 __all__ = ["decision_rule", "identify"]
@@ -42,7 +43,8 @@ def identify(
 
     Tracks are numbered through all systems in their order. Two systems differ by something that lasts some time with
     each object (antenna and reflector, latency) and is now and then many times as large (a poor satellite position,
-    multilateration far outside its area): a mixture over its size. What codes say is added to the ratio.
+    multilateration far outside its area): a mixture over its size. What codes say is added to the ratio. Two tracks of
+    one radar may be echoes of one object, too.
 
     Args:
         systems: registered.
@@ -64,6 +66,9 @@ def identify(
             found = _mixed(a, b, pairing, reach, max(settings.window, _ROWS * max(_interval(a), _interval(b))))
             gain = _identity(systems[i], systems[j], found.pairs)
             parts.append((found._replace(llr=found.llr + gain[found.pair]), int(first[i]), int(first[j])))
+        split = split_evidence(systems[i], settings)
+        if split is not None:
+            parts.append((split, int(first[i]), int(first[i])))
     evidence = join_evidence(parts)
     number = np.repeat(np.arange(len(systems)), np.diff(first))
     address = np.concatenate([s.view.icao24 for s in systems])

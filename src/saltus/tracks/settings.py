@@ -163,7 +163,8 @@ class SystemsSettings:
     Attributes:
         reference: name of the system whose positions hold; "" = that with the smallest stated noise.
         p_false: largest probability of being two objects with which two tracks are declared one.
-        p_false_split: the same for two tracks of one system.
+        p_false_split: the same for two tracks of one radar, second echoes of an object in motion.
+        split_offset: standard deviation of the distance between two echoes of one object, each axis, m.
         hysteresis: log-odds by which a declared pair may fall short of the best alternative, nats.
         window: s; what tracks did longer ago says nothing about whether they are one object now.
         settle: s after its confirmation within which the decision on a new local track counts from its beginning.
@@ -176,7 +177,8 @@ class SystemsSettings:
 
     reference: str = ""
     p_false: float = 1e-3
-    p_false_split: float = 1e-6
+    p_false_split: float = 1e-3
+    split_offset: float = 20.0
     hysteresis: float = 5.0
     window: float = 120.0
     settle: float = 12.0
@@ -192,6 +194,7 @@ class SystemsSettings:
             if not 0.0 < getattr(self, name) < 0.5:
                 raise ModelError(f"systems.{name} is a probability below 0.5, got {getattr(self, name)}.")
         for name in (
+            "split_offset",
             "hysteresis",
             "window",
             "settle",

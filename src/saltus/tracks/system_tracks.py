@@ -18,6 +18,7 @@ from saltus.tracks.measurements import Measurements
 from saltus.tracks.membership import Segments
 from saltus.tracks.rows import Assignments, Rows, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.splits import second_echoes
 from saltus.tracks.systems import Registered
 
 __all__ = ["Part", "SystemTracking", "track_systems"]
@@ -71,7 +72,8 @@ def track_systems(
 
     A system track that one local track of an unbiased system makes alone is published as its tracker left it. Every
     other one is filtered anew from all measurements of its local tracks in exact time order, corrected for the biases
-    of their systems, from the state in which the first of them was published. Bearings stay with their own system.
+    of their systems, from the state in which the first of them was published. Bearings stay with their own system, and
+    second echoes move no state.
 
     Args:
         parts: systems in the order in which local tracks are numbered.
@@ -96,8 +98,10 @@ def track_systems(
         np.where(segment >= 0, segments.system_track[segment], 0) if len(segments.track) else np.zeros(len(m), np.int64)
     )
     lanes = _lanes(m, of, local, rows)
+    echo = _echoing(lanes, raw_time, segments, parts)
     alone = _published_as_left(parts, lanes, m, owner)
     kept = _kept(rows, parts, first, segments, alone)
+    lanes = _Lanes(*(column[~echo] for column in lanes))
     anew = _anew(lanes, alone, m, rows, parts, owner, lasting, (filters, settings), periods, use_identity=use_identity)
     return SystemTracking(join_rows([kept, anew]), m, _assigned(parts, place, of, rows))
 
@@ -144,6 +148,17 @@ def _lanes(m: Measurements, of: _Index, local: _Index, rows: Rows) -> _Lanes:
     index = np.flatnonzero(of > 0)
     index = index[np.lexsort((m.time[index], of[index]))]
     return _Lanes(index, of[index], local[index], row[index])
+
+
+def _echoing(lanes: _Lanes, time: _Array, segments: Segments, parts: Sequence[Part]) -> _Mask:
+    """Say which rows are second echoes."""
+    system = np.repeat(np.arange(len(parts)), [len(p.system.ids) for p in parts])
+    own = np.flatnonzero(segments.track < len(system))  # another centre's tracks, numbered last, have no measurements
+    out = np.zeros(len(lanes.number), bool)
+    for spell in second_echoes(Segments(*(column[own] for column in segments)), system):
+        when = time[lanes.number]
+        out |= (lanes.local == spell.track) & (when >= spell.time_from) & (when < spell.time_to)
+    return out
 
 
 def _published_as_left(parts: Sequence[Part], lanes: _Lanes, m: Measurements, owner: _Index) -> _Mask:
