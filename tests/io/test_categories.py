@@ -147,6 +147,14 @@ def test_adsb_2_1_takes_the_finer_position(tmp_path):
     assert (p.icao24[0], p.on_ground[0], p.kind[0]) == (0xABCDEF, 1, Kind.GEODETIC)
 
 
+def test_adsb_0_26_has_no_finer_position(tmp_path):
+    # FSPEC d9 01 01 02: 010 040 - 130 080 - - | - - - - - - - | - - - - - - - | - - - - - 131 -
+    # 130: 40 degrees are 7456540 = 71c71c steps of 180/2^25; 131 is the signal amplitude, 1 byte
+    body = "d9010102 14db 0000 0071c71c00000000 abcdef 7f"
+    got = load(tmp_path, block(21, body), editions={21: "0.26"})
+    assert np.degrees(got.plots.latitude[0]) == pytest.approx(7456540 * 180 / 2**25, abs=1e-12)
+
+
 def test_round_trip_of_simulated_plots(tmp_path, rng):
     n = 400
     truth = dict(

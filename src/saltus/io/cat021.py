@@ -70,7 +70,7 @@ def _time(c: Columns) -> np.ndarray:
 def _position(c: Columns) -> tuple[np.ndarray, np.ndarray, float]:
     """Latitude and longitude, rad, from the finer item present, and the step of most of them."""
     coarse = c.number("130", "LAT"), c.number("130", "LON")
-    if not c.defines("131"):
+    if c.defines("030"):  # 0.x: 131 is no position there (in 0.26 the signal amplitude)
         return *coarse, c.layout.field("130", "LAT").lsb
     fine = c.has("131")
     latitude = np.where(fine, c.number("131", "LAT"), coarse[0])
