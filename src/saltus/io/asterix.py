@@ -24,6 +24,7 @@ __all__ = ["read_asterix"]
 
 _SAMPLE = 200  # blocks looked at to tell the edition
 _FITS, _ENOUGH = 0.5, 20  # an edition that parses less of this many blocks is not theirs
+_SURELY = 0.9  # an edition that parses as much is theirs, where the one asked for is not
 _TOLD = 8  # problems of one kind told one by one
 
 
@@ -43,7 +44,7 @@ def read_asterix(
         progress: called with the file's name and the fraction read.
 
     Raises:
-        DataError: the file is empty, holds no record, or an edition does not exist.
+        DataError: the file is empty, holds no record, or an edition does not exist or is plainly not the file's.
     """
     data = path.read_bytes()
     name = path.name
@@ -56,7 +57,7 @@ def read_asterix(
     unread = []
     for number in sorted({b.category for b in blocks}):
         mine = [b for b in blocks if b.category == number]
-        edition, note = _edition(number, mine, editions.get(number))
+        edition, note = _edition(number, mine, editions.get(number), name)
         if edition:
             chosen[number], notes[number] = edition, (note,) if note else ()
         else:
@@ -72,7 +73,7 @@ def read_asterix(
     return Part(Plots.build(0, (), (name,), {}), None, tuple(unread), tuple(problems), in_order=True, dated=captured)
 
 
-def _edition(number: int, blocks: Sequence[Block], asked: str | None) -> tuple[str, str]:
+def _edition(number: int, blocks: Sequence[Block], asked: str | None, name: str) -> tuple[str, str]:
     """Choose the edition: as asked, or the one whose definitions parse most of a sample; then the newest.
 
     Returns:
@@ -81,14 +82,11 @@ def _edition(number: int, blocks: Sequence[Block], asked: str | None) -> tuple[s
     known = categories().get(number)
     if known is None:
         return "", f"{len(blocks)} blocks; no definition of it is known."
-    if asked is not None:
-        if asked not in known:
-            raise DataError(
-                f"edition {asked!r} of category {number} is not known; choose one of {', '.join(known)} in [editions]."
-            )
-        return asked, ""
     whole = [b for b in blocks if not b.cut] or list(blocks)
     sample = whole[:: max(1, len(whole) // _SAMPLE)][:_SAMPLE]
+    if asked is not None:
+        _check_asked(number, asked, sample, name)
+        return asked, ""
     scores = {edition: _score(number, edition, sample) for edition in known}
     best = max(scores.values())
     alike = [edition for edition, score in scores.items() if score == best]
@@ -105,8 +103,29 @@ def _edition(number: int, blocks: Sequence[Block], asked: str | None) -> tuple[s
     return chosen, f"edition guessed: {span} parses {best[0]:.0%} of {len(sample)} sample blocks, others {others:.0%}"
 
 
-def _score(number: int, edition: str, sample: Sequence[Block]) -> tuple[float, float]:
-    """Share of the sample that an edition parses, and how well its numbers hang together."""
+def _check_asked(number: int, asked: str, sample: Sequence[Block], name: str) -> None:
+    """Refuse an edition that does not exist, or that most blocks do not follow while they follow another."""
+    known = categories()[number]
+    if asked not in known:
+        raise DataError(
+            f"edition {asked!r} of category {number} is not known; choose one of {', '.join(known)} in [editions]."
+        )
+    share = _parse(number, asked, sample)[1]
+    if share >= _FITS or len(sample) < _ENOUGH:
+        return
+    scores = {edition: _score(number, edition, sample) for edition in known if edition != asked}
+    best = max(scores.values(), default=(0.0, 0.0))
+    if best[0] >= _SURELY:
+        fits = [edition for edition, score in scores.items() if score == best]
+        raise DataError(
+            f"{name}: category {number} is not of edition {asked}, as configured: it parses {share:.0%} of "
+            f"{len(sample)} sample blocks, {' and '.join(fits)} {best[0]:.0%}. "
+            f'Write {number} = "{fits[-1]}" in [editions], or leave it out to have it guessed.'
+        )
+
+
+def _parse(number: int, edition: str, sample: Sequence[Block]) -> tuple[Records, float]:
+    """What an edition makes of the sample, and the share of its blocks that follow it."""
     category = CATEGORIES.get(number)
     records = Records(layout(number, edition), frozenset(category.items if category else ()))
     n_good = 0
@@ -116,10 +135,17 @@ def _score(number: int, edition: str, sample: Sequence[Block]) -> tuple[float, f
             n_good += 1
         except Malformed:
             pass
+    return records, n_good / len(sample)
+
+
+def _score(number: int, edition: str, sample: Sequence[Block]) -> tuple[float, float]:
+    """Share of the sample that an edition parses, and how well its numbers hang together."""
+    category = CATEGORIES.get(number)
+    records, share = _parse(number, edition, sample)
     plausible = category.plausible if category else None
     sense = plausible(records.columns()) if plausible and records.fspecs else 1.0
     # A definition that parses by luck is betrayed by its numbers; single ones may be off in good recordings.
-    return n_good / len(sample) * (1.0 if sense > 0.5 else 0.0), round(sense, 1)
+    return share * (1.0 if sense > 0.5 else 0.0), round(sense, 1)
 
 
 def _unread(name: str, number: int, note: str) -> Contents:
