@@ -78,6 +78,17 @@ def test_a_file_given_twice_counts_once(tmp_path):
     assert [c.rejected for c in twice.contents] == [{}, {"duplicate": 50}]
 
 
+def test_a_recording_doubled_is_as_one(tmp_path):
+    tods = np.arange(100.0, 400.0)
+    frames = [plot(tod=t, theta=k, kind="00" if k % 5 == 2 else "a0") for k, t in enumerate(tods)]
+    once = load(tmp_path, frames)
+    twice = load(tmp_path, frames + frames)
+    usable = twice.plots.take(twice.plots.reason == 0)
+    assert usable.record.tolist() == once.plots.take(once.plots.reason == 0).record.tolist()
+    assert twice.contents[0].rejected == {"coasted by station": 120, "duplicate": 240}
+    assert once.problems == twice.problems == ()
+
+
 @pytest.mark.parametrize(
     ("frame", "reason"),
     [

@@ -52,10 +52,11 @@ def merge(parts: Sequence[Part]) -> Recording:
     plots = Plots.concat([part.plots for part in parts])
     reason = plots.reason.copy()
     _mark_values(plots, reason)
-    _mark_duplicates(plots, reason)
+    again = _repeats(plots, reason)
+    _mark(reason, again, "duplicate")
     for k, part in enumerate(parts):
         if part.in_order:
-            problems += _mark_order(plots, reason, k)
+            problems += _mark_order(plots, reason, again, k)
     plots = replace(plots, reason=reason)
     tables = [part.tracks for part in parts if part.tracks is not None]
     first_file = np.cumsum([0] + [len(part.plots.files) for part in parts])
@@ -96,26 +97,29 @@ def _outside(plots: Plots, name: str) -> npt.NDArray[np.bool_]:
     return outside
 
 
-def _mark_duplicates(plots: Plots, reason: npt.NDArray[np.int8]) -> None:
-    """Mark usable reports that repeat an earlier one to the bit."""
-    usable = np.flatnonzero(reason == 0)
-    words = [plots.source[usable].astype(np.int64), plots.kind[usable].astype(np.int64)]
-    words += [plots.icao24[usable].astype(np.int64), plots.time[usable].view(np.int64)]
+def _repeats(plots: Plots, reason: npt.NDArray[np.int8]) -> npt.NDArray[np.bool_]:
+    """Tell the reports that repeat an earlier one of the same reason to the bit."""
+    words = [plots.source.astype(np.int64), plots.kind.astype(np.int64), reason.astype(np.int64)]
+    words += [plots.icao24.astype(np.int64), plots.time.view(np.int64)]
     for names in zip(*_POSITION.values(), strict=True):  # the coordinates of the report's own kind
-        kinds = [plots.kind[usable] == kind for kind in _POSITION]
-        words.append(np.select(kinds, [getattr(plots, n)[usable].view(np.int64) for n in names]))
+        kinds = [plots.kind == kind for kind in _POSITION]
+        words.append(np.select(kinds, [getattr(plots, n).view(np.int64) for n in names]))
     order = np.lexsort(words[::-1])  # stable: earlier reports first
     table = np.stack(words)[:, order]
-    again = np.all(table[:, 1:] == table[:, :-1], axis=0)
-    reason[usable[order[1:][again]]] = REASONS.index("duplicate")
+    again = np.zeros(len(plots), np.bool_)
+    again[order[1:]] = np.all(table[:, 1:] == table[:, :-1], axis=0)
+    return again
 
 
-def _mark_order(plots: Plots, reason: npt.NDArray[np.int8], file: int) -> list[str]:
-    """Mark the reports of one file that come too late or whose clock jumped; tell lasting steps."""
+def _mark_order(plots: Plots, reason: npt.NDArray[np.int8], again: npt.NDArray[np.bool_], file: int) -> list[str]:
+    """Mark the reports of one file that come too late or whose clock jumped; tell lasting steps.
+
+    Repeated reports, used or not (coasted, ...), say nothing about the clock: a recording doubled is as one.
+    """
     told = []
-    skipped = [REASONS.index(text) for text in ("duplicate", "no time", "system track")]
+    skipped = [REASONS.index(text) for text in ("no time", "system track")]
     for k, source in enumerate(plots.sources):
-        mine = (plots.file == file) & (plots.source == k) & ~np.isin(reason, skipped)
+        mine = (plots.file == file) & (plots.source == k) & ~np.isin(reason, skipped) & ~again
         index = np.flatnonzero(mine & np.isfinite(plots.time))
         faults = order_faults(plots.time[index])
         jump, late = np.zeros(len(plots), np.bool_), np.zeros(len(plots), np.bool_)
