@@ -84,6 +84,24 @@ def test_a_clock_set_back_before_the_start_loses_nothing():
     assert not late.any() and not jump.any()
 
 
+@pytest.mark.parametrize("period", [0.2, 2.0])
+@pytest.mark.parametrize("order", [(1, 0, 2), (2, 0, 1), (0, 2, 1), (2, 1, 0)])
+def test_stretches_out_of_order_lose_nothing(period, order):
+    stretches = np.split(period * np.arange(900.0), 3)
+    late, jump, steps = order_faults(np.concatenate([stretches[k] for k in order]))
+    assert not late.any() and not jump.any()
+    assert steps
+
+
+def test_a_sparse_clock_set_back_drops_what_it_repeats():
+    """One report every 2 s: the intervals between the later reports are no silence."""
+    time = np.concatenate([np.arange(0.0, 200.0, 2.0), np.arange(101.0, 400.0, 2.0)])
+    late, jump, steps = order_faults(time)
+    assert steps == (100,)
+    assert time[jump].tolist() == np.arange(102.0, 200.0, 2.0).tolist()
+    assert not late.any() and not jump[100:].any()
+
+
 def test_a_passing_leap_ahead_is_dropped():
     time = np.arange(0.0, 200.0)
     time[60:90] += 1000.0

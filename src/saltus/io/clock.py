@@ -14,6 +14,7 @@ DAY = 86400.0  # s
 SORTING_WINDOW = 2.0  # s: radars send sector by sector, multi-channel receivers a little late
 _WILD = 60.0  # s: a report this far behind is no late report, its clock jumped
 _LONE = 600.0  # s: the last reports of a file have no followers to confirm a leap of this size
+_SILENT = 10.0, 20.0  # s and median intervals: where later reports are silent for longer, they repeat no time
 _AHEAD, _FOR_GOOD, _EXCURSION = 10, 50, 100  # reports looked at to tell wild, lasting and passing steps apart
 
 
@@ -63,8 +64,9 @@ def order_faults(time: Float[np.ndarray, " n"]) -> OrderFaults:
     older than it (a lone wild time must not make its neighbours late). A report behind it by more than the sorting
     window is late, or a jump when it is a minute or more behind. When nine in ten of the next fifty are behind
     as well, the clock was set back for good: the reports from there on are right and keep their times, and of the
-    earlier ones those in the interval that the clock then repeats are jumps (if the clock had only leapt ahead for
-    up to a hundred reports, these are). Leaps ahead for good are gaps.
+    earlier ones those among the times that the clock then repeats are jumps (if the clock had only leapt ahead for
+    up to a hundred reports, these are). Leaps ahead for good are gaps, and what an earlier stretch tells of a gap
+    is no repetition: recordings joined out of order keep their reports.
 
     Args:
         time: (N,) s, finite.
@@ -118,8 +120,13 @@ def _mark_repeated(
     jump: npt.NDArray[np.bool_],
     steps: list[int],
 ) -> None:
-    """Mark the reports before each step back whose times occur again after it."""
+    """Mark the reports before each step back among those that came after it, unless these are silent there."""
     for step, end in pairwise([*steps, len(time)]):
-        again = time[step:end][~(late | jump)[step:end]]
-        if len(again):
-            jump[:step] |= (time[:step] >= again.min()) & (time[:step] <= again.max())
+        again = np.unique(time[step:end][~(late | jump)[step:end]])
+        if len(again) < 2:
+            continue
+        pause = np.diff(again)
+        silent = np.append(pause > max(_SILENT[0], _SILENT[1] * float(np.median(pause))), False)
+        before = np.searchsorted(again, time[:step], side="right") - 1  # the last of the later ones not after it
+        inside = (before >= 0) & (time[:step] <= again[-1])
+        jump[:step] |= inside & (~silent[before] | (time[:step] == again[before]))

@@ -130,8 +130,8 @@ def _mark_order(plots: Plots, reason: npt.NDArray[np.int8], again: npt.NDArray[n
             back = plots.time[index[step - 1]] - plots.time[index[step]]
             told.append(
                 f"{plots.files[file]}: record {plots.record[index[step]]} of {source.system}: the clock steps back by "
-                f"{back:.3f} s for good. Later reports keep their times; of the earlier ones those in the interval "
-                "that the clock repeats are not used (clock jump)."
+                f"{back:.3f} s for good. Later reports keep their times; of the earlier ones those at times that the "
+                "clock repeats are not used (clock jump). If recordings were joined out of order, give them apart."
             )
     return told
 
