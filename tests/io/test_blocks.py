@@ -181,3 +181,9 @@ def test_unknown_formats_name_the_known_ones(tmp_path):
 def test_containers_are_refused(recordings):
     with pytest.raises(DataError, match=r"unknown format.*container"):
         read([recordings / "asterix_small" / "spain_multiradar_8s.gps"])
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.parquet", "a.txt", "a.pcap"])
+def test_asterix_is_told_by_its_first_block_whatever_it_is_called(tmp_path, name):
+    (tmp_path / name).write_bytes(PLOT + PLOT)
+    assert read([tmp_path / name]).contents[0].system.category == 48

@@ -11,7 +11,7 @@ from saltus.io.merge import merge
 from saltus.io.part import Part
 from saltus.records import Recording
 
-__all__ = ["FORMATS", "Format", "read"]
+__all__ = ["FORMATS", "Format", "read", "read_part"]
 
 Progress = Callable[[str, float], None]
 Reader = Callable[[Path, datetime.date | None, Mapping[int, str], Progress | None], Part]
@@ -63,7 +63,7 @@ def read(
 ) -> Recording:
     """Read files and merge them by time.
 
-    The format is told by the first bytes, else by the suffix, else by ASTERIX blocks at the start.
+    The format is told by the first bytes (a whole ASTERIX block among them), else by the suffix.
 
     Args:
         paths: files; each by its name in messages and in `Plots.files`.
@@ -77,10 +77,18 @@ def read(
     """
     if not paths:
         raise DataError("no input given: name at least one recording.")
-    parts = []
-    for path in [Path(p) for p in paths]:
-        parts.append(_format_of(path).reader(path, date, editions or {}, progress))
-    return merge(parts)
+    return merge([read_part(Path(path), date=date, editions=editions, progress=progress) for path in paths])
+
+
+def read_part(
+    path: Path,
+    *,
+    date: datetime.date | None = None,
+    editions: Mapping[int, str] | None = None,
+    progress: Progress | None = None,
+) -> Part:
+    """Read one file of those that `saltus.io.merge.merge` joins; arguments and errors are those of `read`."""
+    return _format_of(path).reader(path, date, editions or {}, progress)
 
 
 def _format_of(path: Path) -> Format:
@@ -93,13 +101,13 @@ def _format_of(path: Path) -> Format:
     for entry in FORMATS:
         if head.startswith(entry.magic):
             return entry
-    for entry in FORMATS:
-        if path.suffix.lower() in entry.suffixes:
-            return entry
     from saltus.io.blocks import looks_like_asterix
 
     if looks_like_asterix(head):
-        return next(entry for entry in FORMATS if entry.reader is _asterix)
+        return next(entry for entry in FORMATS if entry.name == "ASTERIX")
+    for entry in FORMATS:
+        if path.suffix.lower() in entry.suffixes:
+            return entry
     known = "; ".join(f"{entry.name} ({', '.join(entry.suffixes)})" for entry in FORMATS)
     raise DataError(
         f"{path}: unknown format: it begins with {head[:8].hex(' ')} and not with an ASTERIX block. Known: {known}. "
