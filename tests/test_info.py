@@ -70,6 +70,19 @@ def test_one_clear_line_for_what_cannot_be(recording, tmp_path):
         assert len(result.output.strip().splitlines()) == 1
 
 
+def test_files_that_cannot_be_read_are_named_after_the_others(recording, tmp_path):
+    (tmp_path / "x.json").write_text("{}")
+    (tmp_path / "empty.ast").touch()
+    one = info(tmp_path / "x.json", recording)
+    assert one.exit_code == 2
+    assert "2 target reports, 2 usable" in one.output
+    assert "x.json: unknown format" in one.output.splitlines()[-1]
+    two = info(tmp_path / "x.json", recording, tmp_path / "empty.ast")
+    assert two.exit_code == 2
+    assert "2 target reports, 2 usable" in two.output
+    assert ["x.json: unknown" in two.output.splitlines()[-2], "empty" in two.output.splitlines()[-1]] == [True, True]
+
+
 def test_recordings_as_given(recordings):
     folder = recordings / "lebl_2016-05-10"
     result = info(folder / "smr.ast", "--config", folder / "sensors.toml")

@@ -12,7 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from saltus.config import Config, load_config, parse_date
-from saltus.io import read
+from saltus.errors import DataError, SaltusError
+from saltus.io import read_part
+from saltus.io.merge import merge
+from saltus.io.part import Part
 from saltus.records import Contents, Recording
 
 __all__ = ["show_info"]
@@ -24,22 +27,35 @@ _DAY = 86400.0  # s
 def show_info(inputs: Sequence[Path], config_path: Path | None, date: str | None) -> None:
     """Print systems, editions, counts, times, update period, fields and rejected reports of recordings.
 
+    Files that cannot be read are named after all others are shown.
+
     Args:
         inputs: files.
         config_path: TOML file with date, editions and sensors, or None.
         date: YYYY-MM-DD of the first record; goes before the configuration's.
 
     Raises:
-        DataError: a file cannot be read at all.
+        DataError: files cannot be read at all.
         ModelError: the configuration or the date is wrong.
     """
     config = load_config(config_path)
     day = parse_date(date) if date else config.date
-    recording = read(inputs, date=day, editions=config.editions)
+    parts: list[Part] = []
+    failures: dict[str, SaltusError | OSError] = {}
+    for path in inputs:
+        try:
+            parts.append(read_part(path, date=day, editions=config.editions))
+        except (SaltusError, OSError) as error:
+            failures.setdefault(str(error), error)
     console = Console(highlight=False)
     if not console.is_terminal:
         console = Console(highlight=False, width=_PLAIN_WIDTH)
-    _show(console, recording, config)
+    if parts:
+        _show(console, merge(parts), config)
+    if len(failures) == 1:
+        raise next(iter(failures.values()))
+    if failures:
+        raise DataError("\n".join(failures))
 
 
 def _show(console: Console, recording: Recording, config: Config) -> None:
