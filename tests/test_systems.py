@@ -128,6 +128,13 @@ def test_two_radars_with_an_azimuth_bias_and_no_codes(tmp_path):
             assert mine.sum() > 0.55 * ((found.labels == k) & (found.source == name)).sum()
         error = position[at] - (start[k] + velocity[k] * time[at][:, None])
         assert np.sqrt((error**2).sum(-1).mean()) < 60.0  # the bias alone is 300 m at 30 km
+    # What is learnt of a bias moves no target: neither its speed nor the sensor's good name suffers.
+    settled = (found.tracks["status"].to_numpy(zero_copy_only=False) == "confirmed") & (time > 60.0)
+    speed = found.tracks["speed_mps"].to_numpy()
+    for k in range(n):
+        at = settled & (ids == main[k])
+        assert np.abs(speed[at] - np.hypot(*velocity[k])).max() < 30.0
+    assert sum(f["flagged_plots"] for f in found.summary["faults"].values()) < 0.01 * len(found.labels)
     mixed = [t for t in np.unique(ids) if len(np.unique(found.labels[found.track_id == t])) > 1]
     assert not mixed
 

@@ -21,6 +21,8 @@ from saltus.tracks.rows import Assignments, Rows, join_rows
 __all__ = ["SIGMAS", "Sensors", "Tracked", "health_of", "noise_rows", "reported_kind", "show_summary", "summarise"]
 
 _DOUBTFUL_NIS = 3.0  # of two degrees of freedom
+_TOO_SMALL_NIS = 0.3
+_FAR_OFF = 30.0  # factor between a configured standard deviation and the estimate of it
 _UNITS = {"sigma_range_m": "σ of range, m", "sigma_azimuth_deg": "σ of azimuth, °", "sigma_xy_m": "σ of position, m"}
 SIGMAS = {  # by what a source reports: label, field of Noise, unit
     Kind.POLAR: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
@@ -186,20 +188,39 @@ def _doubts(noise: dict[str, Any]) -> list[str]:
         "correlation_time in the configuration."
         for name, row in noise.items()
         if row["nis_mean"] is not None and row["nis_mean"] > _DOUBTFUL_NIS
+    ] + [
+        f"{name}: {why}; is a unit wrong (NM for m, radians for degrees), or sigma in the configuration?"
+        for name, row in noise.items()
+        for why in _implausible(row)
     ]
+
+
+def _implausible(row: dict[str, Any]) -> list[str]:
+    """Say what of one source's noise cannot be as it is."""
+    why = []
+    nis = row["nis_mean"]
+    if nis is not None and nis < _TOO_SMALL_NIS:
+        why.append(f"NIS {nis} where 2 is expected: the errors are far smaller than the noise used")
+    for label in (label for label in row if label.startswith("sigma")):
+        configured, estimated = row[label]["configured"], row[label]["estimated"]
+        if configured and estimated and max(configured / estimated, estimated / configured) > _FAR_OFF:
+            why.append(f"{label} is configured as {configured} and its tracks say {estimated}")
+    return why
 
 
 def _rounded(value: float) -> float | None:
     return float(f"{value:.4g}") if np.isfinite(value) else None
 
 
-def show_summary(summary: dict[str, Any], output: Path, report: bool) -> None:
-    """Say on the screen what was done and where it lies."""
+def show_summary(summary: dict[str, Any], output: Path, report: bool, systems: Sequence[str] = ()) -> None:
+    """Say on the screen what was done and where it lies; `systems`: lines on several systems."""
     reports, tracks = summary["reports"], summary["tracks"]
     click.echo(f"{reports['read']} reports read, {reports['used']} on {tracks['confirmed']} confirmed tracks")
     for reason, count in summary["reasons"].items():
         click.echo(f"  {count:>8} {reason}")
     for name, row in summary["noise"].items():
+        if row["nis_mean"] is None and not any(row[label]["estimated"] for label in row if label.startswith("sigma")):
+            continue  # no plots, or too few to say anything
         sigmas = ", ".join(
             f"{label} {row[label]['used']} (configured {row[label]['configured'] or 'none'}, "
             f"estimated {row[label]['estimated'] or 'unknown'})"
@@ -208,7 +229,10 @@ def show_summary(summary: dict[str, Any], output: Path, report: bool) -> None:
         )
         click.echo(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (expected 2)")
     for name, row in summary["faults"].items():
-        click.echo(_said_of_faults(name, row))
+        if row["judged_plots"]:
+            click.echo(_said_of_faults(name, row))
+    for line in systems:
+        click.echo(line)
     for problem in summary["problems"]:
         click.echo(f"note: {problem}", err=True)
     seconds = summary["seconds"]

@@ -25,6 +25,7 @@ from saltus.run.identified import (
     conflict_lines,
     identification_summary,
     identification_table,
+    system_lines,
     systems_found,
 )
 from saltus.run.pipeline import Identified, track_plots
@@ -89,11 +90,11 @@ def track_files(
             **{name: asdict(getattr(config, name)) for name in ("tracker", "filter", "systems", "registration")},
         }
         summary["seconds"] = {"decoding": round(decoded - began, 2), "tracking": round(done - decoded, 2)}
+        titles = {str(s.system): name for s, name in zip(plots.sources, sensors.names, strict=True)}
         _write(folder, tracks, assigned, whole, summary)
         if report:
             from saltus.report import write_report
 
-            titles = {str(s.system): name for s, name in zip(plots.sources, sensors.names, strict=True)}
             sites = {str(s.system): site for s, site in zip(plots.sources, sensors.sites, strict=True) if site}
             write_report(
                 folder / "report.html",
@@ -106,7 +107,7 @@ def track_files(
                 sensors=health_of(sensors, tracked),
                 systems=systems_found(whole, config.systems, titles),
             )
-    show_summary(summary, output, report)
+    show_summary(summary, output, report, system_lines(whole, titles))
     return summary
 
 

@@ -15,7 +15,14 @@ from saltus.tracks.membership import Segments
 from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.systems import Registered
 
-__all__ = ["bias_tables", "conflict_lines", "identification_summary", "identification_table", "systems_found"]
+__all__ = [
+    "bias_tables",
+    "conflict_lines",
+    "identification_summary",
+    "identification_table",
+    "system_lines",
+    "systems_found",
+]
 
 _LASTING = 20.0  # s: a conflict shorter than this is no line for the user
 _MOST_LINES = 8
@@ -132,6 +139,32 @@ def conflict_lines(whole: Identified) -> list[str]:
     if len(found) > _MOST_LINES:
         lines.append(f"{len(found) - _MOST_LINES} more identity conflicts: see the report.")
     return lines
+
+
+def system_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
+    """Say how each of several systems differs from the one it was compared with, and how much of it was identified."""
+    if len(whole.systems) < 2:
+        return []
+    counts, out = identification_summary(whole), []
+    for r in whole.registered:
+        own = counts[r.name]
+        known = f"{own['identified_with_another_system']} of {own['local_tracks']} tracks identified with another's"
+        if r.found is None:
+            out.append(f"system {titles.get(r.name, r.name)}: the reference; {known}")
+            continue
+        told = ", ".join(_in_words(name, b) for name, b in _biases(r)["biases"].items()) or "no bias told"
+        common = int(r.found.series.objects[-1]) if len(r.found.series.time) else 0
+        pair = f"{titles.get(r.name, r.name)} minus {titles.get(r.to, r.to)}"
+        out.append(f"system {pair} ({common} common objects): {told}; {known}")
+    return out
+
+
+def _in_words(name: str, bias: Mapping[str, float]) -> str:
+    what, _, unit = name.rpartition("_")
+    if (what, unit) == ("range", "scale"):
+        what, unit = "range scale", ""
+    digits = max(0, 1 - int(np.floor(np.log10(bias["sd"])))) if bias["sd"] > 0 else 3
+    return f"{what} {bias['value']:.{digits}f} ± {bias['sd']:.{digits}f} {unit.replace('deg', '°')}".rstrip()
 
 
 def systems_found(whole: Identified, settings: SystemsSettings, titles: Mapping[str, str]) -> SystemsFound | None:

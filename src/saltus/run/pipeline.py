@@ -7,6 +7,7 @@ import numpy as np
 import pyarrow as pa
 
 from saltus.config import Config
+from saltus.errors import ModelError
 from saltus.geo import Plane
 from saltus.identify import Decisions, Episodes, Evidence, join_evidence
 from saltus.progress import Progress
@@ -17,7 +18,9 @@ from saltus.tracks.identities import identify
 from saltus.tracks.local import LocalSystem, Party, foreign_systems, group_sources, local_system
 from saltus.tracks.measurements import make_plane
 from saltus.tracks.membership import Segments, segments
+from saltus.tracks.registration import RegistrationSettings
 from saltus.tracks.rows import join_rows
+from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.system_tracks import Part, track_systems
 from saltus.tracks.systems import Registered, lasting_difference, register_all
 
@@ -67,9 +70,10 @@ def track_plots(
         local.append(local_system(party.name, m, found.assignments, rows, numbers, use_identity=use_identity))
     if foreign is not None and len(foreign):
         local += _foreign(foreign, plane, config, plots, use_identity=use_identity)
+    reference = _reference(config.systems.reference, parties, sensors, [system.name for system in local])
     if len(local) == 1:
         return tracked[0], _single(local[0])
-    whole = _identified(local, config)
+    whole = _identified(local, replace(config.systems, reference=reference), config.registration)
     return _joined(tracked, parties, whole, plane, sensors, config, use_identity=use_identity), whole
 
 
@@ -107,9 +111,20 @@ def _single(system: LocalSystem) -> Identified:
     return Identified([system], [Registered(system.name, "", None)], lives, Decisions(nobody, ()), join_evidence([]))
 
 
-def _identified(local: Sequence[LocalSystem], config: Config) -> Identified:
-    registered, how = register_all(local, config.systems, config.registration)
-    decisions, evidence = identify(registered, how, config.systems)
+def _reference(told: str, parties: Sequence[Party], sensors: Sensors, systems: Sequence[str]) -> str:
+    """Return the system that the configuration calls its reference, by its name or that of one of its sensors."""
+    if not told or told in systems:
+        return told
+    of_sensor = {sensors.names[s]: party.name for party in parties for s in party.sources}
+    if told not in of_sensor:
+        known = ", ".join(dict.fromkeys([*systems, *of_sensor]))
+        raise ModelError(f"systems.reference = {told!r} names none of the systems in the inputs: {known}.")
+    return of_sensor[told]
+
+
+def _identified(local: Sequence[LocalSystem], settings: SystemsSettings, expected: RegistrationSettings) -> Identified:
+    registered, how = register_all(local, settings, expected)
+    decisions, evidence = identify(registered, how, settings)
     begin, end = [], []
     for system in local:
         tracks = system.view.tracks
@@ -118,7 +133,7 @@ def _identified(local: Sequence[LocalSystem], config: Config) -> Identified:
         begin.append(tracks.time[first])
         end.append(tracks.time[last])
     ready = np.concatenate([s.ready for s in local])
-    lives = segments(np.concatenate(begin), ready, np.concatenate(end), decisions.episodes, config.systems.settle)
+    lives = segments(np.concatenate(begin), ready, np.concatenate(end), decisions.episodes, settings.settle)
     return Identified(registered, how, lives, decisions, evidence)
 
 

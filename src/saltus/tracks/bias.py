@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 
 from saltus.tracks.measurements import Measurements
 
-__all__ = ["GROUPS", "PARAMETERS", "BiasSeries", "corrected", "effects", "second_order", "spread"]
+__all__ = ["GROUPS", "PARAMETERS", "BiasSeries", "corrected", "effects", "learnt", "second_order", "spread"]
 
 _Array = npt.NDArray[np.float64]
 
@@ -83,6 +83,26 @@ def second_order(mean: Float[np.ndarray, "*n q"]) -> Float[np.ndarray, "*n q"]:
 def spread(effect: Float[np.ndarray, "n 2 q"], cov: Float[np.ndarray, "*n q q"]) -> Float[np.ndarray, "n 2 2"]:
     """Return the covariance of position that uncertain biases leave, B P B', m^2."""
     return np.asarray(effect @ cov @ effect.swapaxes(-1, -2))
+
+
+def learnt(
+    series: BiasSeries,
+    ray: Float[np.ndarray, "n 2"],
+    velocity: Float[np.ndarray, "n 2"],
+    before: Float[np.ndarray, " n"],
+    after: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 2"]:
+    """Return how much further corrections move a position at one time than they did at an earlier one, m.
+
+    Args:
+        series: what was known of a system's biases.
+        ray: from the site to the position, m; NaN where the sensor measures no range and azimuth.
+        velocity: m/s.
+        before: s.
+        after: s.
+    """
+    change = series.at(after)[0] - series.at(before)[0]
+    return np.asarray(-np.einsum("nij,nj->ni", effects(ray, velocity), change))
 
 
 def corrected(m: Measurements, at: npt.NDArray[np.intp], series: BiasSeries) -> Measurements:

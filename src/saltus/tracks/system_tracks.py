@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.bias import corrected
+from saltus.tracks.bias import corrected, effects, learnt, spread
 from saltus.tracks.faults import PlotLaw, plot_law
 from saltus.tracks.fuse import Fused, LaneRows, fuse
 from saltus.tracks.kinematics import Moments
+from saltus.tracks.lanes import Lanes, held, in_several, is_first, latest, shortest_periods, since, with_coasted
 from saltus.tracks.lifecycle import COASTED, CONFIRMED, TENTATIVE
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.measurements import Measurements
@@ -27,7 +28,8 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
-_SLACK = 0.6  # of a period: how late a plot may come before it counts as missed
+_LATELY = 30.0  # s within which another system must have seen a target for its frame to hold
+_STEP = 2.0  # standard deviations of a report by which a correction steps, from which a state is moved with it
 
 
 class Part(NamedTuple):
@@ -49,13 +51,16 @@ class SystemTracking(NamedTuple):
     assignments: Assignments
 
 
-class _Lanes(NamedTuple):
-    """Measurements of confirmed local tracks, sorted by system track, then by time."""
+class _Scene(NamedTuple):
+    """Everything measured, of all systems."""
 
-    number: _Index  # measurement
-    track: _Index  # system track
-    local: _Index  # local track, through all systems
-    row: _Index  # row of the local tracker that this measurement gave, -1 none
+    parts: Sequence[Part]
+    m: Measurements  # corrected for biases, in time order
+    rows: Rows  # of the local trackers, measurements numbered as in m
+    owner: _Index  # part of each measurement
+    time: _Array  # of each measurement, as reported, s
+    velocity: _Array  # (N, 2): what the local tracker said of its target, 0 where it said nothing, m/s
+    doubt: _Array  # (N, 2, 2): what uncertain biases leave of each position, m^2
 
 
 def track_systems(
@@ -88,21 +93,20 @@ def track_systems(
     rows = join_rows([_renumbered(part, at) for part, at in zip(parts, place, strict=True)])
     first = np.cumsum([0, *(len(p.system.ids) for p in parts)])
     local, owner = _local_tracks(parts, place, first, len(m))
+    scene = _scene(parts, place, m, rows, owner)
     segment = np.full(len(m), -1)
     known = np.flatnonzero(local >= 0)
-    raw_time = np.zeros(len(m))
-    for part, at in zip(parts, place, strict=True):
-        raw_time[at] = part.m.time
-    segment[known] = segments.at(local[known], raw_time[known])
+    segment[known] = segments.at(local[known], scene.time[known])
     of = (
         np.where(segment >= 0, segments.system_track[segment], 0) if len(segments.track) else np.zeros(len(m), np.int64)
     )
     lanes = _lanes(m, of, local, rows)
-    echo = _echoing(lanes, raw_time, segments, parts)
+    echo = _echoing(lanes, scene.time, segments, parts)
     alone = _published_as_left(parts, lanes, m, owner)
     kept = _kept(rows, parts, first, segments, alone)
-    lanes = _Lanes(*(column[~echo] for column in lanes))
-    anew = _anew(lanes, alone, m, rows, parts, owner, lasting, (filters, settings), periods, use_identity=use_identity)
+    lanes = Lanes(*(column[~echo] for column in lanes))
+    lanes = lanes._replace(piece=np.cumsum(is_first(lanes.track) | _reframed(lanes, scene)))
+    anew = _anew(lanes, alone, scene, lasting, (filters, settings), periods, use_identity=use_identity)
     return SystemTracking(join_rows([kept, anew]), m, _assigned(parts, place, of, rows))
 
 
@@ -119,6 +123,18 @@ def _merged(parts: Sequence[Part]) -> tuple[Measurements, list[_Index]]:
     where[order] = np.arange(len(order))
     edge = np.cumsum([0, *(len(m) for m in fixed)])
     return Measurements(**{k: v[order] for k, v in columns.items()}), [where[a:b] for a, b in pairwise(edge)]
+
+
+def _scene(parts: Sequence[Part], place: Sequence[_Index], m: Measurements, rows: Rows, owner: _Index) -> _Scene:
+    time, velocity, doubt = np.zeros(len(m)), np.zeros((len(m), 2)), np.zeros((len(m), 2, 2))
+    update = np.flatnonzero(rows.measurement >= 0)
+    velocity[rows.measurement[update]] = rows.moments.mean[update][:, [1, 3]]
+    for part, at in zip(parts, place, strict=True):
+        time[at] = part.m.time
+        if part.registered.found is not None:
+            _, cov = part.registered.found.series.at(part.m.time)
+            doubt[at] = spread(effects(m.ray[at], velocity[at]), cov)
+    return _Scene(parts, m, rows, owner, time, velocity, doubt)
 
 
 def _renumbered(part: Part, at: _Index) -> Rows:
@@ -141,16 +157,40 @@ def _local_tracks(parts: Sequence[Part], place: Sequence[_Index], first: _Index,
     return local, owner
 
 
-def _lanes(m: Measurements, of: _Index, local: _Index, rows: Rows) -> _Lanes:
+def _lanes(m: Measurements, of: _Index, local: _Index, rows: Rows) -> Lanes:
     row = np.full(len(m), -1)
     update = np.flatnonzero(rows.measurement >= 0)
     row[rows.measurement[update]] = update
     index = np.flatnonzero(of > 0)
     index = index[np.lexsort((m.time[index], of[index]))]
-    return _Lanes(index, of[index], local[index], row[index])
+    return Lanes(index, of[index], local[index], row[index], of[index])
 
 
-def _echoing(lanes: _Lanes, time: _Array, segments: Segments, parts: Sequence[Part]) -> _Mask:
+def _reframed(lanes: Lanes, scene: _Scene) -> _Mask:
+    """Say at which rows what is known of a system's biases has stepped further than the noise of its reports.
+
+    No target moved there: a track that this system sees alone goes on from the state of the local tracker, moved into
+    the new frame. Where another system sees it, too, the state is in that one's frame already.
+    """
+    m, owner = scene.m, scene.owner[lanes.number]
+    out = np.zeros(len(lanes.number), bool)
+    usable = (lanes.row >= 0) & np.isfinite(m.position[lanes.number, 0])
+    for k, part in enumerate(scene.parts):
+        at = np.flatnonzero(usable & (owner == k))
+        if part.registered.found is None or not len(at):
+            continue
+        other = latest(np.where(owner == k, -1, np.arange(len(owner))), lanes.track)
+        met = np.where(other >= 0, scene.time[lanes.number[other]], -np.inf)
+        again = np.flatnonzero(~is_first(lanes.track[at]))
+        index, before = lanes.number[at[again]], lanes.number[at[again - 1]]
+        span = scene.time[before], scene.time[index]
+        shift = learnt(part.registered.found.series, m.ray[index], scene.velocity[index], *span)
+        d2 = np.einsum("ni,nij,nj->n", shift, np.linalg.inv(m.cov[index, :2, :2]), shift)
+        out[at[again]] = (d2 > _STEP**2) & (span[1] - met[at[again]] > _LATELY)
+    return out
+
+
+def _echoing(lanes: Lanes, time: _Array, segments: Segments, parts: Sequence[Part]) -> _Mask:
     """Say which rows are second echoes."""
     system = np.repeat(np.arange(len(parts)), [len(p.system.ids) for p in parts])
     own = np.flatnonzero(segments.track < len(system))  # another centre's tracks, numbered last, have no measurements
@@ -161,7 +201,7 @@ def _echoing(lanes: _Lanes, time: _Array, segments: Segments, parts: Sequence[Pa
     return out
 
 
-def _published_as_left(parts: Sequence[Part], lanes: _Lanes, m: Measurements, owner: _Index) -> _Mask:
+def _published_as_left(parts: Sequence[Part], lanes: Lanes, m: Measurements, owner: _Index) -> _Mask:
     """Say of each system track (by number, 0 unused) whether its one local track's own rows are published."""
     count = int(lanes.track.max(initial=0)) + 1
     fewest, most = np.full(count, np.iinfo(np.int64).max), np.full(count, -1)
@@ -201,12 +241,9 @@ def _taken(rows: Rows, at: _Index) -> Rows:
 
 
 def _anew(
-    lanes: _Lanes,
+    lanes: Lanes,
     alone: _Mask,
-    m: Measurements,
-    rows: Rows,
-    parts: Sequence[Part],
-    owner: _Index,
+    scene: _Scene,
     lasting: float,
     rules: tuple[FilterSettings, TrackerSettings],
     periods: Sequence[float],
@@ -214,49 +251,27 @@ def _anew(
     use_identity: bool,
 ) -> Rows:
     """Filter the other system tracks."""
-    filters, settings = rules
+    (filters, settings), (m, rows) = rules, (scene.m, scene.rows)
     pick = ~alone[lanes.track] & np.isfinite(m.position[lanes.number, 0])
-    lanes = _Lanes(*(column[pick] for column in lanes))
-    started = _since(lanes.row >= 0, lanes.track)
-    lanes = _Lanes(*(column[started] for column in lanes))
+    lanes = Lanes(*(column[pick] for column in lanes))
+    started = since(lanes.row >= 0, lanes.track)
+    lanes = Lanes(*(column[started] for column in lanes))
     if not len(lanes.number):
         return join_rows([])
-    index, begin = lanes.number, np.flatnonzero(_first(lanes.track))
-    start = _start(rows, lanes, begin, m, parts, owner)
-    several = _several(lanes.track, owner[index])
+    index, begin = lanes.number, np.flatnonzero(is_first(lanes.piece))
+    start = _start(rows, lanes, begin, m, scene.parts, scene.owner)
+    several = in_several(lanes.piece, scene.owner[index])
     cov = m.cov[index] * m.inflation[index, None, None]
-    cov[:, :2, :2] += (several * 0.5 * lasting**2)[:, None, None] * np.eye(2)
+    cov[:, :2, :2] += several[:, None, None] * (0.5 * lasting**2 * np.eye(2) + scene.doubt[index])
     faulty = _faulty(m, index, settings, periods) + (cov - m.cov[index])[:, None]
-    lane = np.cumsum(_first(lanes.track)) - 1
+    lane = np.cumsum(is_first(lanes.piece)) - 1
     updates = LaneRows(lane, m.time[index], m.position[index], cov, faulty)
-    every, measured = _coasting(updates, _periods(lanes, m, periods), settings)
+    every, measured = with_coasted(updates, lanes.track, shortest_periods(lanes, m, periods), settings)
     fused = fuse(every, start, filters, settings)
     return _published(every, measured, fused, lanes, m, rows, use_identity=use_identity)
 
 
-def _first(track: _Index) -> _Mask:
-    return np.asarray(np.diff(track, prepend=-1) != 0)
-
-
-def _since(event: _Mask, track: _Index) -> _Mask:
-    """Say of each row whether the event has happened in its lane, there included."""
-    if not len(track):
-        return np.zeros(0, bool)
-    count = np.cumsum(event)
-    first = np.maximum.accumulate(np.where(_first(track), np.arange(len(track)), 0))
-    return np.asarray(count - count[first] + event[first] > 0)
-
-
-def _several(track: _Index, owner: _Index) -> _Mask:
-    """Say of each row whether its lane holds measurements of several systems."""
-    count = int(track.max(initial=0)) + 1
-    low, high = np.full(count, np.iinfo(np.int64).max), np.full(count, -1)
-    np.minimum.at(low, track, owner)
-    np.maximum.at(high, track, owner)
-    return np.asarray(low[track] != high[track])
-
-
-def _start(rows: Rows, lanes: _Lanes, begin: _Index, m: Measurements, parts: Sequence[Part], owner: _Index) -> Moments:
+def _start(rows: Rows, lanes: Lanes, begin: _Index, m: Measurements, parts: Sequence[Part], owner: _Index) -> Moments:
     """State of the local tracker at the first row of each lane, moved with the measurement it was made from."""
     row, index = lanes.row[begin], lanes.number[begin]
     raw, turn = np.empty((len(m), 2)), np.zeros(len(m))
@@ -293,38 +308,11 @@ def _faulty(m: Measurements, index: _Index, settings: TrackerSettings, periods: 
     return out
 
 
-def _periods(lanes: _Lanes, m: Measurements, periods: Sequence[float]) -> _Array:
-    """Shortest update period of the sources that each lane has had so far, s."""
-    own = np.asarray(periods, float)[m.source[lanes.number]]
-    out, first = own.copy(), np.flatnonzero(_first(lanes.track))
-    for a, b in zip(first, np.append(first[1:], len(own)), strict=True):
-        out[a:b] = np.minimum.accumulate(own[a:b])
-    return out
-
-
-def _coasting(updates: LaneRows, period: _Array, settings: TrackerSettings) -> tuple[LaneRows, _Index]:
-    """Put rows without measurement where one was expected; return all rows, and the update each of them is, -1 none."""
-    n = len(updates.lane)
-    last = np.append(updates.lane[1:] != updates.lane[:-1], True)
-    limit = np.maximum(settings.coast_scans * period, settings.coast_seconds)
-    ahead = np.where(last, limit, np.minimum(np.append(np.diff(updates.time), 0.0) - _SLACK * period, limit))
-    count = np.maximum(np.floor(ahead / period + 1e-9), 0).astype(np.int64)
-    source = np.repeat(np.arange(n), count)
-    number = np.arange(len(source)) - np.repeat(np.cumsum(count) - count, count) + 1
-    lane = np.concatenate([updates.lane, updates.lane[source]])
-    time = np.concatenate([updates.time, updates.time[source] + number * period[source]])
-    order = np.lexsort((time, lane))
-    measured = np.concatenate([np.arange(n), np.full(len(source), -1)])[order]
-    pick = np.concatenate([np.arange(n), source])[order]
-    position = np.where(measured[:, None] >= 0, updates.position[pick], np.nan)
-    return LaneRows(lane[order], time[order], position, updates.cov[pick], updates.faulty[pick]), measured
-
-
 def _published(
     every: LaneRows,
     measured: _Index,
     fused: Fused,
-    lanes: _Lanes,
+    lanes: Lanes,
     m: Measurements,
     rows: Rows,
     *,
@@ -334,16 +322,16 @@ def _published(
     seen = measured >= 0
     index, track = lanes.number[at], lanes.track[at]
     known = (lanes.row >= 0) & (rows.status[np.maximum(lanes.row, 0)] == CONFIRMED)
-    sure = _since(known, lanes.track)[at]
+    sure = since(known, lanes.track)[at]
     status = np.where(seen, np.where(sure, CONFIRMED, TENTATIVE), COASTED)
     nu = every.position[:, :2] - fused.centre
     d2 = np.einsum("ki,kij,kj->k", nu, np.linalg.inv(fused.gate_cov), nu)
     wrong = fused.p_fault.sum(axis=1)
-    d2[_first(track) | ~seen | (np.nan_to_num(wrong) > 0.5)] = np.nan
+    d2[is_first(lanes.piece[at]) | ~seen | (np.nan_to_num(wrong) > 0.5)] = np.nan
     polar = np.isfinite(m.ray[index, 0])
     likeliest = np.where(polar & (fused.p_fault[:, -1] > fused.p_fault[:, 0]), 2, 1)
     nothing = np.full(len(lanes.number), -1)
-    icao24, mode3a = (_latest(c[lanes.number] if use_identity else nothing, lanes.track) for c in (m.icao24, m.mode3a))
+    icao24, mode3a = (latest(c[lanes.number] if use_identity else nothing, lanes.track) for c in (m.icao24, m.mode3a))
     named = np.where(m.named[lanes.number] & use_identity, lanes.number, -1)
     keep = seen | sure  # a tentative track is not coasted
     out = Rows(
@@ -351,32 +339,18 @@ def _published(
         time=every.time,
         moments=fused.moments,
         status=status.astype(np.int8),
-        has_altitude=_since(np.isfinite(m.position[lanes.number, 2]), lanes.track)[at],
+        has_altitude=since(np.isfinite(m.position[lanes.number, 2]), lanes.track)[at],
         icao24=icao24[at].astype(np.int32),
         mode3a=mode3a[at].astype(np.int16),
-        named=_latest(named, lanes.track)[at],
+        named=latest(named, lanes.track)[at],
         measurement=np.where(seen, index, -1),
         centre=fused.centre,
         gate_cov=fused.gate_cov,
         d2=d2,
-        p_fault=_held(wrong, track),
+        p_fault=held(wrong, track),
         fault=np.where(seen & np.isfinite(wrong), likeliest, 0).astype(np.int8),
     )
     return _taken(out, np.flatnonzero(keep))
-
-
-def _latest(values: npt.NDArray[np.integer], track: _Index) -> _Index:
-    """The last value that is not negative, in each lane so far; -1 before."""
-    at = np.where(values >= 0, np.arange(len(values)), -1)
-    at = np.maximum.accumulate(at)
-    first = np.maximum.accumulate(np.where(_first(track), np.arange(len(values)), 0))
-    return np.asarray(np.where(at >= first, values[np.maximum(at, 0)], -1), np.int64)
-
-
-def _held(values: _Array, track: _Index) -> _Array:
-    """The last value that is a number, in each lane so far."""
-    at = _latest(np.where(np.isnan(values), -1, np.arange(len(values))), track)
-    return np.asarray(np.where(at >= 0, values[np.maximum(at, 0)], np.nan))
 
 
 def _assigned(parts: Sequence[Part], place: Sequence[_Index], of: _Index, rows: Rows) -> Assignments:
