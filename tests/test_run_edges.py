@@ -40,6 +40,8 @@ def test_an_empty_window_names_the_recordings_span(tmp_path):
     path = table(tmp_path / "day.csv", START + 36000.0 + 4.0 * np.arange(30))
     with pytest.raises(DataError, match=r"the recording lasts from .* 10:00:00 to"):
         track_files([path], tmp_path / "out", time_from="12:00", report=False)
+    with pytest.raises(DataError, match=r"--from 10:02 is after --to 10:01: .* 10:02:00 and .* 10:01:00"):
+        track_files([path], tmp_path / "out", time_from="10:02", time_to="10:01", report=False)
     with pytest.raises(DataError, match="is no time"):
         parse_time("noon", START)
 

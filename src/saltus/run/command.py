@@ -154,6 +154,8 @@ def _window(time_from: str | None, time_to: str | None, start: float, end: float
 
     first = start if time_from is None else read(time_from, start)
     last = end if time_to is None else read(time_to, first)
+    if first > last and time_from is not None and time_to is not None:
+        raise DataError(f"--from {time_from} is after --to {time_to}: {_utc(first)} and {_utc(last)} (UTC).")
     if first > last or first > end or last < start:
         raise DataError(
             f"every report is outside time window {_utc(first)} to {_utc(last)}: the recording lasts from "
