@@ -62,6 +62,8 @@ def test_tables_are_known_by_name(tmp_path):
         ("date = 2023-13-02", "c.toml: no readable TOML"),
         ('date = "02.05.2023"', "date '02.05.2023'.*YYYY-MM-DD"),
         ("date = 2023-05-02T10:00:00", "write a date"),
+        ("date = 1066-01-01", "date 1066-01-01: the year must lie from 1970 to 2100"),
+        ('date = "2101-01-01"', "date 2101-01-01: the year must lie from 1970 to 2100"),
         ("sensors = 1", "unknown key 'sensors'. Did you mean sensor"),
         ("[sensor]\nsac = 1", r"write \[\[sensor\]\]"),
         (SENSOR.replace("41.3", "413"), r"number 1: latitude = 413: .*less than or equal to 90.*degrees north"),

@@ -63,6 +63,7 @@ _HINTS = {
     "editions": 'category = "edition" in quotes, as 21 = "0.23"',
 }
 
+_YEARS = 1970, 2100  # of a recording: times count from the first, reports after the last are out of range
 T = TypeVar("T", TrackerSettings, FilterSettings, SystemsSettings, RegistrationSettings)
 _Octet = Annotated[int, Field(ge=0, le=255)]
 _Sigma = Annotated[float, Field(gt=0.0, le=1e4)]
@@ -155,17 +156,23 @@ def parse_date(text: str) -> datetime.date:
     """Read a date given on the command line.
 
     Raises:
-        ModelError: it is no date of the form YYYY-MM-DD.
+        ModelError: it is no date of the form YYYY-MM-DD, or not from 1970 to 2100.
     """
     try:
-        return datetime.date.fromisoformat(text)
+        return _of_our_time(datetime.date.fromisoformat(text))
     except ValueError as error:
         raise ModelError(f"date {text!r}: {error}. Write YYYY-MM-DD, as 2023-05-02.") from error
 
 
+def _of_our_time(date: datetime.date) -> datetime.date:
+    if not _YEARS[0] <= date.year <= _YEARS[1]:
+        raise ModelError(f"date {date}: the year must lie from {_YEARS[0]} to {_YEARS[1]}.")
+    return date
+
+
 def _date(path: Path | str, value: object) -> datetime.date:
     if isinstance(value, datetime.date) and not isinstance(value, datetime.datetime):
-        return value
+        return _of_our_time(value)
     if isinstance(value, str):
         return parse_date(value)
     raise ModelError(f"{path}: date = {value}: write {_HINTS['date']}.")
