@@ -26,7 +26,6 @@ alone. Rows count from 0, without the header.
 """
 
 import csv
-import datetime
 from collections.abc import Sequence
 from io import BytesIO, StringIO
 from pathlib import Path
@@ -36,6 +35,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from saltus.errors import DataError
+from saltus.io.cells import codes, numbers, tell, times, truths
 from saltus.io.merge import LIMITS
 from saltus.io.observer import FRAME, observer_columns
 from saltus.io.part import Part, revisit, scan_period
@@ -68,7 +68,6 @@ _POSITIONS = (
 _KINDS = {"polar": Kind.POLAR, "plane": Kind.PLANE, "geodetic": Kind.GEODETIC, "bearing": Kind.BEARING}
 _CODES = {"icao24": (16, 0xFFFFFF), "mode3a": (8, 0o7777)}  # base, largest
 _COLUMNS = ("time", *_NUMBERS, *_CODES, "callsign", "on_ground", "source", "kind")
-_TRUTH = {"true": 1, "1": 1, "1.0": 1, "t": 1, "yes": 1, "false": 0, "0": 0, "0.0": 0, "f": 0, "no": 0}
 _LIMIT_OF = {"heading": "azimuth", "origin_latitude": "latitude", "origin_longitude": "longitude"} | {
     "observer_x": "x",
     "observer_y": "y",
@@ -151,17 +150,17 @@ def _read(path: Path, table: pa.Table, rows: npt.NDArray[np.int64], problems: li
     _need_columns(path, names)
     if not table.num_rows:
         raise DataError(f"{path}: row 0: the table has columns and no row.")
-    columns: dict[str, npt.ArrayLike] = {"time": _times(path, table["time"], problems)}
+    columns: dict[str, npt.ArrayLike] = {"time": times(path, table["time"], problems)}
     for name, (target, factor) in _NUMBERS.items():
         if name in names:
-            columns[target] = _numbers(path, name, table[name], problems) * factor
+            columns[target] = numbers(path, name, table[name], problems) * factor
     for name, (base, largest) in _CODES.items():
         if name in names:
-            columns[name] = _codes(path, name, table[name], base, largest, problems)
+            columns[name] = codes(path, name, table[name], base, largest, problems)
     if "callsign" in names:
         columns["callsign"] = [str(v or "").strip() for v in table["callsign"].to_pylist()]
     if "on_ground" in names:
-        columns["on_ground"] = _truths(path, table["on_ground"], problems)
+        columns["on_ground"] = truths(path, table["on_ground"], problems)
     columns["kind"] = _kinds(columns, names)
     if "kind" in names:
         columns["kind"] = _stated_kinds(path, table["kind"], columns["kind"], problems)
@@ -176,88 +175,6 @@ def _need_columns(path: Path, names: Sequence[str]) -> None:
         wanted = "time" if "time" not in names else "a position: " + ", or ".join(" and ".join(p) for p in pairs)
         shown = ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
         raise DataError(f"{path}: no column for {wanted}. The columns are: {shown}. Names and units are fixed.")
-
-
-def _times(path: Path, column: pa.ChunkedArray, problems: list[str]) -> npt.NDArray[np.float64]:
-    """UTC seconds from numbers, time stamps or text."""
-    if pa.types.is_timestamp(column.type):
-        micro = column.cast(pa.timestamp("us"), safe=False).cast(pa.int64())
-        return _floats(micro) / 1e6
-    if not _is_text(column.type):
-        return _numbers(path, "time", column, problems)
-    values = np.full(len(column), np.nan)
-    bad = []
-    for k, text in enumerate(column.to_pylist()):
-        try:
-            values[k] = _seconds(text) if text else np.nan
-        except ValueError:
-            bad.append((k, text))
-    _tell(path, "time", bad, "neither seconds nor ISO 8601", problems)
-    return values
-
-
-def _seconds(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        moment = datetime.datetime.fromisoformat(text.strip())
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=datetime.UTC)
-    epoch = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
-    return (moment - epoch) / datetime.timedelta(seconds=1)
-
-
-def _numbers(path: Path, name: str, column: pa.ChunkedArray, problems: list[str]) -> npt.NDArray[np.float64]:
-    """A column as float64, absent and unreadable cells NaN."""
-    if not _is_text(column.type):
-        try:
-            return _floats(column)
-        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-            raise DataError(f"{path}: column {name!r} is of type {column.type}; it must hold numbers.") from error
-    values = np.full(len(column), np.nan)
-    bad = []
-    for k, text in enumerate(column.to_pylist()):
-        try:
-            values[k] = float(text) if text else np.nan
-        except ValueError:
-            bad.append((k, text))
-    _tell(path, name, bad, "no number", problems)
-    return values
-
-
-def _floats(column: pa.ChunkedArray) -> npt.NDArray[np.float64]:
-    values: npt.NDArray[np.float64] = column.cast(pa.float64(), safe=False).to_numpy().astype(np.float64)
-    return values
-
-
-def _codes(
-    path: Path, name: str, column: pa.ChunkedArray, base: int, largest: int, problems: list[str]
-) -> npt.NDArray[np.int64]:
-    """Codes from text in base 16 or 8, absent and unreadable ones -1."""
-    kind = {16: "hexadecimal", 8: "octal"}[base]
-    if not (_is_text(column.type) or pa.types.is_null(column.type)):
-        raise DataError(f"{path}: column {name!r} is of type {column.type}; give {kind} digits as text.")
-    values = np.full(len(column), -1, np.int64)
-    bad = []
-    for k, text in enumerate(column.to_pylist()):
-        if text and text.strip():
-            try:
-                values[k] = int(text.strip(), base)
-            except ValueError:
-                bad.append((k, text))
-            else:
-                if not 0 <= values[k] <= largest:
-                    bad.append((k, text))
-                    values[k] = -1
-    _tell(path, name, bad, f"no {kind} code", problems)
-    return values
-
-
-def _truths(path: Path, column: pa.ChunkedArray, problems: list[str]) -> npt.NDArray[np.int64]:
-    cells = ["" if v is None else str(v).strip().lower() for v in column.to_pylist()]
-    bad = [(k, v) for k, v in enumerate(cells) if v not in _TRUTH and v not in ("", "nan")]
-    _tell(path, "on_ground", bad, "neither true nor false", problems)
-    return np.array([_TRUTH.get(v, -1) for v in cells], np.int64)
 
 
 def _kinds(columns: dict[str, npt.ArrayLike], names: Sequence[str]) -> npt.NDArray[np.int8]:
@@ -278,7 +195,7 @@ def _stated_kinds(
     """What the column `kind` says, else what the row gives."""
     cells = [str(v or "").strip().lower() for v in column.to_pylist()]
     bad = [(k, v) for k, v in enumerate(cells) if v and v not in _KINDS]
-    _tell(path, "kind", bad, f"no kind of report ({', '.join(_KINDS)})", problems)
+    tell(path, "kind", bad, f"no kind of report ({', '.join(_KINDS)})", problems)
     stated = np.array([_KINDS.get(v, Kind.NONE) for v in cells], np.int8)
     return np.where(stated == Kind.NONE, np.asarray(found), stated)
 
@@ -299,7 +216,7 @@ def _check_units(path: Path, columns: dict[str, npt.ArrayLike]) -> None:
 def _tell_impossible(path: Path, columns: dict[str, npt.ArrayLike], problems: list[str]) -> None:
     for name, values, outside in _impossible(columns):
         bad = [(int(k), f"{values[k]:g}") for k in np.flatnonzero(outside)]
-        _tell(path, name, bad, "out of range", problems)
+        tell(path, name, bad, "out of range", problems)
 
 
 def _impossible(
@@ -318,19 +235,6 @@ def _impossible(
 
 def _unit(name: str) -> str:
     return "m/s" if name.endswith("_mps") else "m" if name.endswith("_m") else "degrees"
-
-
-def _tell(path: Path, name: str, bad: Sequence[tuple[int, object]], what: str, problems: list[str]) -> None:
-    if bad:
-        row, cell = bad[0]
-        more = f", and in {len(bad) - 1} more rows" if len(bad) > 1 else ""
-        problems.append(f"{path.name}: row {row}, column {name!r}: {str(cell)[:40]!r} is {what}{more}.")
-
-
-def _is_text(kind: pa.DataType) -> bool:
-    if pa.types.is_dictionary(kind):
-        kind = kind.value_type
-    return bool(pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_string_view(kind))
 
 
 def _part(path: Path, table: pa.Table, columns: dict[str, npt.ArrayLike], problems: list[str]) -> Part:
