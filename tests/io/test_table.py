@@ -133,6 +133,8 @@ def test_bad_cells_name_row_and_column_and_the_rest_is_kept(tmp_path):
         ("", "t.csv: byte 0: the file is empty"),
         ("time,x_m,y_m\n", "has columns and no row"),
         ("x_m,y_m\n1,2\n", "no column for time"),
+        ("time;x_m;y_m\n1,5;1,0;2,0\n", "t.csv: semicolons separate the columns. Separate them by commas"),
+        ("time\tx_m\ty_m\n1\t1\t2\n", "t.csv: tabs separate the columns"),
         ("time,range_m\n1,2\n", "no column for a position: range_m and azimuth_deg"),
         ("time,x_m,y_m\n1000,1\n", "no readable CSV"),
         ("time,x_m,x_m,y_m\n1,1,1,1\n", "column 'x_m' occurs 2 times"),

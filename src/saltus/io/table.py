@@ -84,6 +84,7 @@ def read_csv(path: Path) -> Part:
         DataError: no CSV, needed columns are missing, or a column's unit cannot be right.
     """
     problems: list[str] = []
+    _check_separator(path)
     try:
         table = _csv_as_text(path)
         rows = np.arange(table.num_rows)
@@ -93,6 +94,14 @@ def read_csv(path: Path) -> Part:
     except (pa.ArrowException, OSError) as error:
         raise DataError(f"{path}: no readable CSV table: {str(error).splitlines()[0]}") from error
     return _read(path, table, rows, problems)
+
+
+def _check_separator(path: Path) -> None:
+    with path.open("rb") as file:
+        header = file.readline()
+    for mark, name in ((b";", "semicolons"), (b"\t", "tabs")):
+        if mark in header and b"," not in header:
+            raise DataError(f"{path}: {name} separate the columns. Separate them by commas, and decimals by points.")
 
 
 def _csv_as_text(source: Path | BytesIO) -> pa.Table:
