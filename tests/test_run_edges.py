@@ -49,7 +49,8 @@ def test_an_empty_window_names_the_recordings_span(tmp_path):
 def test_a_cut_row_costs_only_itself(tmp_path):
     path = table(tmp_path / "cut.csv", START + 4.0 * np.arange(30), tail=f"{START + 121.0},41\n")
     summary = track_files([path], tmp_path / "out", report=False)
-    assert summary["reports"]["read"] == 30
+    assert summary["reports"]["read"] == 31
+    assert summary["reasons"] == {"broken row": 1}
     assert any("row 30: 2 cells where the header has 4" in line for line in summary["problems"])
 
 
@@ -60,7 +61,7 @@ def test_rows_after_a_ragged_one_keep_their_numbers(tmp_path):
     path.write_text("\n".join(lines) + "\n")
     track_files([path], tmp_path / "out", report=False)
     record = pq.read_table(tmp_path / "out/assignments.parquet")["record"].to_pylist()
-    assert record == [k for k in range(31) if k != 10]
+    assert record == [*(k for k in range(31) if k != 10), 10]  # without a time it stands last
 
 
 def test_single_reports_at_regular_times_tell_the_period(tmp_path):

@@ -32,6 +32,7 @@ REASONS = (
     "outside time window",  # --from / --to
     "site unknown",  # the source needs a site position and none is configured
     "system track",  # CAT062: another system's track, never used as a plot
+    "broken row",  # of a table: more or fewer cells than the header
 )
 
 

@@ -152,6 +152,29 @@ def test_tables_that_cannot_be_used(tmp_path, text, message):
         csv(tmp_path, text)
 
 
+def test_broken_rows_are_counted_with_the_source_before(tmp_path):
+    rows = [
+        "1000000000,1,2,A",
+        "",
+        "1000000001,3,4,B",
+        "1000000002,5",
+        "1000000003,5,6,7,C",
+        "1000000004,8,9,A",
+        "x,1,1,B",
+    ]
+    got = csv(tmp_path, "\n".join(["time,x_m,y_m,source", *rows]) + "\n")
+    assert reasons(got) == {0: "", 1: "", 2: "broken row", 3: "broken row", 4: "", 5: "no time"}
+    assert [(c.system.name, c.n_reports, c.rejected) for c in got.contents] == [
+        ("A", 2, {}),
+        ("B", 4, {"no time": 1, "broken row": 2}),
+    ]
+    assert got.contents[1].time_from == got.contents[1].time_to == 1000000001.0
+    assert got.problems == (
+        "t.csv: row 2: 2 cells where the header has 4, and 1 more such rows: not used (broken row).",
+        "t.csv: row 5, column 'time': 'x' is neither seconds nor ISO 8601.",
+    )
+
+
 def test_parquet_that_cannot_be_used(tmp_path):
     (tmp_path / "t.parquet").write_bytes(b"PAR1 and nothing else")
     with pytest.raises(DataError, match=r"t\.parquet: no readable Parquet"):

@@ -179,7 +179,7 @@ def _count(line: Contents, plots: Plots, file: int) -> Contents:
     wild = [
         REASONS.index(text) for text in ("clock jump", "out of order", "no time", "out of range", "coasted by station")
     ]
-    times = plots.time[mine & ~np.isin(plots.reason, wild)]
+    times = plots.time[mine & ~np.isin(plots.reason, wild) & np.isfinite(plots.time)]
     if line.n_records == line.n_reports and len(times):
         return replace(line, time_from=float(times.min()), time_to=float(times.max()))
     return line

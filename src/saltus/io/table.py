@@ -39,7 +39,7 @@ from saltus.io.cells import codes, numbers, tell, times, truths
 from saltus.io.merge import LIMITS
 from saltus.io.observer import FRAME, observer_columns
 from saltus.io.part import Part, revisit, scan_period
-from saltus.records import Contents, Kind, Plots, Source, System
+from saltus.records import REASONS, Contents, Kind, Plots, Source, System
 
 __all__ = ["read_csv", "read_parquet"]
 
@@ -87,13 +87,13 @@ def read_csv(path: Path) -> Part:
     _check_separator(path)
     try:
         table = _csv_as_text(path)
-        rows = np.arange(table.num_rows)
+        broken = np.zeros(table.num_rows, np.bool_)
     except pa.ArrowInvalid as error:
-        whole, rows = _whole_rows(path, problems, error)
-        table = _csv_as_text(whole)
+        blanked, broken = _blank_broken(path, problems, error)
+        table = _csv_as_text(blanked)
     except (pa.ArrowException, OSError) as error:
         raise DataError(f"{path}: no readable CSV table: {str(error).splitlines()[0]}") from error
-    return _read(path, table, rows, problems)
+    return _read(path, table, broken, problems)
 
 
 def _check_separator(path: Path) -> None:
@@ -114,23 +114,33 @@ def _csv_as_text(source: Path | BytesIO) -> pa.Table:
     return arrow.read_csv(BytesIO(content), convert_options=as_text)
 
 
-def _whole_rows(path: Path, problems: list[str], error: pa.ArrowInvalid) -> tuple[BytesIO, npt.NDArray[np.int64]]:
-    """Leave out rows whose number of cells is not the header's, and tell them; most rows must be whole."""
+def _blank_broken(path: Path, problems: list[str], error: pa.ArrowInvalid) -> tuple[BytesIO, npt.NDArray[np.bool_]]:
+    """Empty the rows whose number of cells is not the header's, but for the source of the row before; tell them.
+
+    Returns:
+        The table, and which rows are broken: less than half of them.
+    """
     try:
         lines = list(csv.reader(StringIO(path.read_text(encoding="utf-8"))))
     except UnicodeDecodeError as wrong:
         raise DataError(f"{path}: byte {wrong.start}: not UTF-8 text; save the table as UTF-8 CSV.") from wrong
-    header, body = (lines[0], lines[1:]) if lines else ([], [])
-    whole = [k for k, cells in enumerate(body) if len(cells) == len(header)]
-    if len(whole) <= len(body) // 2:
+    header, body = (lines[0], [cells for cells in lines[1:] if cells]) if lines else ([], [])
+    broken = np.array([len(cells) != len(header) for cells in body], np.bool_)
+    if 2 * np.count_nonzero(broken) >= len(body):
         raise DataError(f"{path}: no readable CSV table: {str(error).splitlines()[0]}") from error
-    for k in sorted(set(range(len(body))) - set(whole)):
-        problems.append(
-            f"{path}: row {k}: {len(body[k])} cells where the header has {len(header)}; the row is left out."
-        )
+    told = [f"row {k}: {len(body[k])} cells where the header has {len(header)}" for k in np.flatnonzero(broken)]
+    more = f", and {len(told) - 1} more such rows" if len(told) > 1 else ""
+    problems.append(f"{path.name}: {told[0]}{more}: not used (broken row).")
+    column = header.index("source") if "source" in header else None
+    last = body[int(np.argmin(broken))]
+    for k, cells in enumerate(body):
+        if broken[k]:
+            body[k] = [last[c] if c == column else "" for c in range(len(header))]
+        else:
+            last = cells
     text = StringIO()
-    csv.writer(text).writerows([header, *(body[k] for k in whole)])
-    return BytesIO(text.getvalue().encode()), np.array(whole, np.int64)
+    csv.writer(text).writerows([header, *body])
+    return BytesIO(text.getvalue().encode()), broken
 
 
 def read_parquet(path: Path) -> Part:
@@ -145,10 +155,10 @@ def read_parquet(path: Path) -> Part:
         table = parquet.read_table(path)
     except (pa.ArrowException, OSError) as error:
         raise DataError(f"{path}: no readable Parquet table: {str(error).splitlines()[0]}") from error
-    return _read(path, table, np.arange(table.num_rows), [])
+    return _read(path, table, np.zeros(table.num_rows, np.bool_), [])
 
 
-def _read(path: Path, table: pa.Table, rows: npt.NDArray[np.int64], problems: list[str]) -> Part:
+def _read(path: Path, table: pa.Table, broken: npt.NDArray[np.bool_], problems: list[str]) -> Part:
     table = table.rename_columns(
         [_ALIASES.get(c, c) if _ALIASES.get(c) not in table.column_names else c for c in table.column_names]
     )
@@ -175,7 +185,9 @@ def _read(path: Path, table: pa.Table, rows: npt.NDArray[np.int64], problems: li
         columns["kind"] = _stated_kinds(path, table["kind"], columns["kind"], problems)
     _check_units(path, columns)
     _tell_impossible(path, columns, problems)
-    return _part(path, table, {**observer_columns(path, columns), "record": rows}, problems)
+    reason = np.where(broken, REASONS.index("broken row"), 0)
+    columns = {**observer_columns(path, columns), "record": np.arange(table.num_rows), "reason": reason}
+    return _part(path, table, columns, problems)
 
 
 def _need_columns(path: Path, names: Sequence[str]) -> None:
