@@ -239,7 +239,29 @@ def test_kinds_stated_and_bearings(tmp_path):
     assert got.plots.kind.tolist() == [polar, plane, bearing, bearing, polar, polar]
     found = reasons(got)
     assert [found[k] for k in (2, 3, 4)] == ["", "", "not a number"]
-    assert "row 5, column 'kind': 'sonar' is no kind" in got.problems[0]
+    assert "row 3: no range_m" in got.problems[0]
+    assert "row 5, column 'kind': 'sonar' is no kind" in got.problems[1]
+
+
+def test_a_range_that_is_no_number_makes_no_bearing_of_a_radar_plot(tmp_path):
+    rows = ["50,10,A", "NaN,11,A", "far,12,A", "inf,13,A", ",14,A", ",15,A", ",16,camera", "nan,17,camera"]
+    got = csv(tmp_path, "time,range_m,azimuth_deg,source\n" + "".join(f"{10**9 + k},{r}\n" for k, r in enumerate(rows)))
+    assert reasons(got) == {
+        **dict.fromkeys(range(8), ""),
+        **{1: "not a number", 2: "not a number", 3: "out of range"},
+    }
+    assert got.plots.kind.tolist() == [Kind.POLAR] * 4 + [Kind.BEARING] * 4
+    told = "t.csv: row 4: no range_m, where its source tells ranges elsewhere; 2 such rows are taken as bearings alone."
+    assert told in got.problems
+    got = parquet(
+        tmp_path,
+        time=1e9 + np.arange(4.0),
+        range_m=pa.array([50.0, float("nan"), None, None]),
+        azimuth_deg=np.arange(4.0),
+        kind=[None, None, None, "bearing"],
+    )
+    assert reasons(got) == {0: "", 1: "not a number", 2: "", 3: ""}
+    assert "row 2: no range_m" in got.problems[0] and "1 such rows" in got.problems[0]
 
 
 def test_an_impossible_heading_costs_the_azimuth(tmp_path):

@@ -20,9 +20,10 @@ Columns, by name; others are passed over and noted:
 and, where the sensor moves, the columns of `saltus.io.observer` that say where it was.
 
 One position is needed: range and azimuth, x and y, latitude and longitude, or the azimuth alone (a bearing). Without
-`kind` the first of these that the row gives is taken. An empty cell (null, NaN) is absent. A row without time or
-position, or with a number that cannot be, is kept as a report with its reason; a code that cannot be read is lost
-alone. Rows count from 0, without the header.
+`kind` the first of these that the row gives is taken. An empty cell (null, NaN) is absent; but where a source tells
+ranges, a range that is NaN or text makes no bearing of its row. A row without time or position, or with a number that
+cannot be, is kept as a report with its reason; a code that cannot be read is lost alone. Rows count from 0, without
+the header.
 """
 
 import csv
@@ -33,6 +34,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from saltus.errors import DataError
 from saltus.io.cells import codes, numbers, tell, times, truths
@@ -110,8 +112,19 @@ def _csv_as_text(source: Path | BytesIO) -> pa.Table:
     content = source.read_bytes() if isinstance(source, Path) else source.getvalue()
     with arrow.open_csv(BytesIO(content)) as reader:
         names = reader.schema.names
-    as_text = arrow.ConvertOptions(column_types={name: pa.string() for name in names}, strings_can_be_null=True)
-    return arrow.read_csv(BytesIO(content), convert_options=as_text)
+    empty = arrow.ConvertOptions().null_values
+    nan = [text for text in empty if text.lower().endswith("nan")]  # a range that is no number is not an absent one
+    as_text = arrow.ConvertOptions(
+        column_types={name: pa.string() for name in names},
+        null_values=[text for text in empty if text not in nan],
+        strings_can_be_null=True,
+    )
+    table = arrow.read_csv(BytesIO(content), convert_options=as_text)
+    for k, name in enumerate(table.column_names):
+        if name != "range_m":
+            absent = pc.is_in(table[k], value_set=pa.array(nan))
+            table = table.set_column(k, name, pc.if_else(absent, pa.scalar(None, pa.string()), table[k]))
+    return table
 
 
 def _blank_broken(path: Path, problems: list[str], error: pa.ArrowInvalid) -> tuple[BytesIO, npt.NDArray[np.bool_]]:
@@ -181,6 +194,8 @@ def _read(path: Path, table: pa.Table, broken: npt.NDArray[np.bool_], problems: 
     if "on_ground" in names:
         columns["on_ground"] = truths(path, table["on_ground"], problems)
     columns["kind"] = _kinds(columns, names)
+    if "range_m" in names:
+        columns["kind"] = _lost_ranges(path, table, columns, problems)
     if "kind" in names:
         columns["kind"] = _stated_kinds(path, table["kind"], columns["kind"], problems)
     _check_units(path, columns)
@@ -207,6 +222,26 @@ def _kinds(columns: dict[str, npt.ArrayLike], names: Sequence[str]) -> npt.NDArr
             if set(pair) <= set(names):
                 given = sum(~np.isnan(np.asarray(columns[_NUMBERS[c][0]])) for c in pair)
                 kinds[(kinds == Kind.NONE) & (given > 0) & (given >= len(pair) - missing)] = kind
+    return kinds
+
+
+def _lost_ranges(
+    path: Path, table: pa.Table, columns: dict[str, npt.ArrayLike], problems: list[str]
+) -> npt.NDArray[np.int8]:
+    """Of sources that tell ranges: make bearings whose range is no number radar plots again, and tell the others."""
+    kinds = np.array(columns["kind"], np.int8)
+    labels = np.array(_labels(path, table))
+    ranging = np.isin(labels, labels[np.isfinite(np.asarray(columns["range"]))])
+    stated = [bool(v) for v in table["kind"].to_pylist()] if "kind" in table.column_names else np.zeros(len(kinds))
+    lone = ranging & (kinds == Kind.BEARING) & ~np.asarray(stated, np.bool_)
+    written = np.array([v is not None and v != "" for v in table["range_m"].to_pylist()])
+    kinds[lone & written] = Kind.POLAR
+    empty = np.flatnonzero(lone & ~written)
+    if len(empty):
+        problems.append(
+            f"{path.name}: row {empty[0]}: no range_m, where its source tells ranges elsewhere; {len(empty)} such rows "
+            "are taken as bearings alone."
+        )
     return kinds
 
 
@@ -258,10 +293,15 @@ def _unit(name: str) -> str:
     return "m/s" if name.endswith("_mps") else "m" if name.endswith("_m") else "degrees"
 
 
+def _labels(path: Path, table: pa.Table) -> list[str]:
+    """The name of each row's source."""
+    named = table["source"].to_pylist() if "source" in table.column_names else [None] * table.num_rows
+    return [str(v) if v not in (None, "") else path.stem for v in named]
+
+
 def _part(path: Path, table: pa.Table, columns: dict[str, npt.ArrayLike], problems: list[str]) -> Part:
     n = table.num_rows
-    named = table["source"].to_pylist() if "source" in table.column_names else [None] * n
-    labels = [str(v) if v not in (None, "") else path.stem for v in named]
+    labels = _labels(path, table)
     systems = [System(None, None, None, label) for label in sorted(set(labels))]
     position = {s.name: k for k, s in enumerate(systems)}
     columns |= {"source": [position[label] for label in labels], "file": np.zeros(n)}
