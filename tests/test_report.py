@@ -284,7 +284,7 @@ def test_large_inputs_are_thinned_and_the_page_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(data, "MAX_PLOTS", 30)
     monkeypatch.setattr(data, "MAX_UPDATES", 30)
     page = render(tmp_path, **scene())
-    assert "One plot in 3 is drawn, of 80" in page.text
+    assert "One report in 3 is drawn, of 80;" in page.text
     assert "One track update in 3 is drawn, of 80" in page.text
     t = column(page.data["updates"]["t"])
     assert len(column(page.data["plots"]["t"])) == 27
@@ -299,6 +299,31 @@ def test_wild_times_of_rejected_reports_do_not_stretch_the_page(tmp_path):
     time[3] = T0 + 1e6
     parts["plots"] = replace(parts["plots"], time=time)
     assert render(tmp_path, **parts).data["t1"] == T0 + 157.0
+
+
+def test_a_time_window_counts_and_draws_only_what_is_inside(tmp_path, monkeypatch):
+    """Of 80 reports 44 are inside, at 0 to 85 s; one of them is rejected, one on no track."""
+    monkeypatch.setattr(data, "MAX_PLOTS", 30)
+    parts = scene()
+    outside = parts["plots"].time > T0 + 86.0
+    reason = np.where(outside, REASONS.index(tables.OUTSIDE), parts["plots"].reason)
+    parts["plots"] = replace(parts["plots"], reason=reason.astype(parts["plots"].reason.dtype))
+    ids, why = parts["assignments"]["track_id"].to_pylist(), parts["assignments"]["reason"].to_pylist()
+    for i in np.flatnonzero(outside):
+        ids[i], why[i] = None, tables.OUTSIDE
+    for name, values, kind in (("track_id", ids, pa.int64()), ("reason", why, pa.string())):
+        at = parts["assignments"].column_names.index(name)
+        parts["assignments"] = parts["assignments"].set_column(at, name, pa.array(values, kind))
+    page = render(tmp_path, **parts)
+    assert page.data["t1"] == T0 + 85.0
+    assert column(page.data["updates"]["t"]).max() == 85.0
+    assert len(column(page.data["plots"]["t"])) == 22 and column(page.data["plots"]["t"]).max() <= 85.0
+    assert "One report in 2 is drawn, of 44 in the time window;" in page.text
+    assert "outside the time window: 36 reports" in page.text
+    rows = tables.reason_rows(parts["assignments"])
+    assert rows[0] == ("on a track", 42, 42 / 44) and rows[-1][:2] == (tables.OUTSIDE, 36)
+    assert np.isnan(rows[-1][2]) and sum(share for *_, share in rows[:-1]) == pytest.approx(1.0)
+    assert "<dt>On a track</dt><dd>42 <small>95.5%" in page.text
 
 
 def test_failed_writing_leaves_the_old_page(tmp_path, monkeypatch):

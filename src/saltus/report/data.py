@@ -10,6 +10,7 @@ import numpy.typing as npt
 from saltus.records import REASONS, Plots
 from saltus.report.columns import encode, numbers, quantise, texts
 from saltus.report.places import plane_about, plot_positions, project
+from saltus.report.tables import show
 from saltus.report.updates import Updates
 
 if TYPE_CHECKING:
@@ -17,10 +18,11 @@ if TYPE_CHECKING:
 
     from saltus.geo import Plane, Site
 
-__all__ = ["MAX_PLOTS", "MAX_UPDATES", "assigned_tracks", "payload", "time_span"]
+__all__ = ["MAX_PLOTS", "MAX_UPDATES", "assigned_tracks", "payload", "rows_within", "time_span", "within"]
 
 MAX_PLOTS = 60_000
 MAX_UPDATES = 150_000
+_OUTSIDE = REASONS.index("outside time window")
 
 
 def payload(
@@ -56,9 +58,27 @@ def _point(plane: "Plane", site: "Site") -> dict[str, float]:
     return {"x": round(float(x), 1), "y": round(float(y), 1)}
 
 
+def within(plots: Plots) -> npt.NDArray[np.bool_]:
+    """Return which reports are inside the time window of the run; all where it had none."""
+    return np.asarray(plots.reason != _OUTSIDE)
+
+
+def rows_within(tracks: "pa.Table", plots: Plots) -> "pa.Table":
+    """Return the rows of tracks up to the last report in the time window of the run; all where it had none.
+
+    A track that lost its object coasts on for a while past the end.
+    """
+    import pyarrow.compute as pc
+
+    inside = within(plots) & np.isfinite(plots.time)
+    if within(plots).all() or not inside.any():
+        return tracks
+    return tracks.filter(pc.less_equal(tracks["time"], float(plots.time[inside].max())))
+
+
 def time_span(plots: Plots, updates: Updates) -> tuple[float, float] | None:
-    """Return the first and last time (s, UTC) of usable plots and tracks, or of all reports; None without any."""
-    for times in (np.concatenate([plots.time[plots.reason == 0], updates.time]), plots.time):
+    """Return the first and last time (s, UTC) of usable plots and tracks, or of all in the window; None without any."""
+    for times in (np.concatenate([plots.time[plots.reason == 0], updates.time]), plots.time[within(plots)]):
         finite = times[np.isfinite(times)]
         if len(finite):
             return float(finite.min()), float(finite.max())
@@ -93,12 +113,18 @@ def _plots(
 ) -> tuple[dict[str, object], list[str]]:
     notes = []
     xy = project(plane, position[:, 0], position[:, 1])
-    drawable = np.flatnonzero(np.isfinite(xy).all(axis=1) & np.isfinite(plots.time))
-    if len(drawable) < len(plots):
-        notes.append(f"Not drawn for want of a position or a time: {len(plots) - len(drawable):,} reports.")
+    inside = within(plots)
+    drawable = np.flatnonzero(inside & np.isfinite(xy).all(axis=1) & np.isfinite(plots.time))
+    n_inside, where = int(inside.sum()), "" if inside.all() else " in the time window"
+    if n_inside < len(plots):
+        notes.append(f"Not drawn, as outside the time window: {show(len(plots) - n_inside)} reports.")
+    if len(drawable) < n_inside:
+        notes.append(f"Not drawn for want of a position or a time: {show(n_inside - len(drawable))} reports{where}.")
     every = -(-len(drawable) // MAX_PLOTS)
     if every > 1:
-        notes.append(f"One plot in {every} is drawn, of {len(drawable):,}; the tracker had all of them.")
+        notes.append(
+            f"One report in {every} is drawn, of {show(len(drawable))}{where}; only the picture leaves the others out."
+        )
         drawable = drawable[::every]
     id_of = np.array([row.id for row in updates.rows], np.float64)
     k = np.searchsorted(id_of, track_id[drawable]) if len(id_of) else np.zeros(len(drawable), np.intp)
@@ -131,7 +157,7 @@ def _tracks(
     if every > 1:
         within = keep - updates.starts[updates.track]
         keep = keep[(within % every == 0) | (keep == updates.starts[updates.track + 1] - 1)]
-        notes.append(f"One track update in {every} is drawn, of {n:,}; the time plots are as coarse.")
+        notes.append(f"One track update in {every} is drawn, of {show(n)}; the time plots are as coarse.")
     table = updates.table.take(keep)
     deg = np.radians(1.0)
     xy = project(plane, deg * numbers(table, "latitude"), deg * numbers(table, "longitude"))

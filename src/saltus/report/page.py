@@ -13,11 +13,11 @@ import numpy as np
 from saltus.io.write import output_file
 from saltus.records import Plots
 from saltus.report.colours import HEIGHT_ENDS, PROBABILITY_ENDS, colour_map
-from saltus.report.data import payload, time_span
+from saltus.report.data import payload, rows_within, time_span
 from saltus.report.section import systems_section
 from saltus.report.sensors import HEIGHT, WIDTH, sensor_rows
 from saltus.report.systems import SystemsFound
-from saltus.report.tables import Block, blocks, innovation_rows, reason_rows, show, title
+from saltus.report.tables import OUTSIDE, Block, blocks, innovation_rows, reason_rows, show, title
 from saltus.report.updates import Updates, groups, read_updates
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def write_report(
         DataError: `path` is a directory.
         OSError: the page cannot be written.
     """
-    updates = read_updates(tracks)
+    updates = read_updates(rows_within(tracks, plots))
     drawn, notes = payload(updates, plots, assignments, innovations, sites)
     jumping, busiest = groups(updates.rows)
     drawn |= {
@@ -128,13 +128,14 @@ def _header(
     names = [Path(str(n)).name for n in inputs] if isinstance(inputs, Sequence) and not isinstance(inputs, str) else []
     names = names or [Path(n).name for n in plots.files]
     counts = reason_rows(assignments)
-    read = sum(n for _, n, _ in counts)
-    used = counts[0][1] if counts else 0
+    read, outside = sum(n for _, n, _ in counts), sum(n for name, n, _ in counts if name == OUTSIDE)
+    used, judged = counts[0][1] if counts else 0, read - outside
     n_confirmed = sum(row.confirmed for row in updates.rows)
     figures = [
         ("Target reports read", show(read), ""),
-        ("On a track", show(used), f"{used / read:.1%}" if read else ""),
-        ("Rejected or unused", show(read - used), f"{(read - used) / read:.1%}" if read else ""),
+        *([("Outside the time window", show(outside), "")] if outside else []),
+        ("On a track", show(used), f"{used / judged:.1%}" if judged else ""),
+        ("Rejected or unused", show(judged - used), f"{(judged - used) / judged:.1%}" if judged else ""),
         ("Confirmed tracks", show(n_confirmed), ""),
         ("Systems", show(len(plots.sources)), ""),
     ]

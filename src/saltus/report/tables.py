@@ -10,7 +10,9 @@ from saltus.report.columns import numbers, texts
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["Block", "blocks", "innovation_rows", "reason_rows", "show", "title"]
+__all__ = ["OUTSIDE", "Block", "blocks", "innovation_rows", "reason_rows", "show", "title"]
+
+OUTSIDE = "outside time window"  # as assignments say it
 
 _UNITS = {"m": "m", "deg": "°", "s": "s", "mps": "m/s", "mps2": "m/s²", "m2": "m²", "ft": "ft", "kt": "kt"} | {
     "nm": "NM",
@@ -135,7 +137,10 @@ def _grid(name: str, corner: str, flat: Iterable[tuple[str, dict[str, str]]]) ->
 
 
 def reason_rows(assignments: "pa.Table") -> list[tuple[str, int, float]]:
-    """Count the reports by what became of them: (reason, number, share), largest first, used ones on top."""
+    """Count the reports by what became of them: (reason, number, share), largest first, used ones on top.
+
+    Shares are of the reports in the time window of the run. Those outside come last and have none (NaN).
+    """
     used = np.isfinite(numbers(assignments, "track_id"))
     if not len(used):
         return []
@@ -143,7 +148,9 @@ def reason_rows(assignments: "pa.Table") -> list[tuple[str, int, float]]:
     names, counts = np.unique([r or "on no track" for r in unused], return_counts=True)
     rows = [("on a track", int(used.sum()))]
     rows += sorted(((str(n), int(c)) for n, c in zip(names, counts, strict=True)), key=lambda r: -r[1])
-    return [(name, n, n / len(used)) for name, n in rows]
+    rows.sort(key=lambda row: row[0] == OUTSIDE)
+    judged = sum(n for name, n in rows if name != OUTSIDE)
+    return [(name, n, np.nan if name == OUTSIDE or not judged else n / judged) for name, n in rows]
 
 
 def innovation_rows(innovations: "pa.Table") -> list[InnovationRow]:

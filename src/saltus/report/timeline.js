@@ -5,10 +5,10 @@ const windowText = document.getElementById("window"), AXIS = 18, LEAST = Math.mi
 const BIN = TIME_STEPS.find((s) => SPAN / s <= 240) || SPAN / 240;
 document.getElementById("bin").textContent = BIN < 60 ? (BIN === 1 ? "second" : BIN + " s") : BIN < 3600 ? (BIN === 60 ? "minute" : BIN / 60 + " min") : fixed(BIN / 3600) + " h";
 const HISTOGRAM = (() => {
-  const bins = Array.from({ length: Math.floor(SPAN / BIN) + 1 }, () => [0, 0]);
+  const bins = Array.from({ length: Math.max(Math.ceil(SPAN / BIN), 1) }, () => [0, 0]);
   for (let i = 0; i < P.t.length; i++) {
-    const k = Math.floor(P.t[i] / BIN);
-    if (bins[k]) bins[k][P.class[i] === 0 ? 0 : 1] += P.every;
+    if (P.t[i] < 0 || P.t[i] > SPAN) continue; // rejected, with a time of its own
+    bins[Math.min(Math.floor(P.t[i] / BIN), bins.length - 1)][P.class[i] === 0 ? 0 : 1] += P.every;
   }
   return bins;
 })();

@@ -177,7 +177,9 @@ def _prepare(
     usable = (reason == 0) & np.isfinite(plots.time)
     if usable.any():
         first, last = _window(time_from, time_to, float(plots.time[usable].min()), float(plots.time[usable].max()))
-        reason[usable & ((plots.time < first) | (plots.time > last))] = REASONS.index("outside time window")
+        early = plots.time < (-np.inf if time_from is None else first)
+        late = plots.time > (np.inf if time_to is None else last)
+        reason[early | late] = REASONS.index("outside time window")  # whatever else was wrong with them
     sensors = _sensors(plots.sources, recording, config)
     for s, source in enumerate(plots.sources):
         needs = (plots.source == s) & np.isin(plots.kind, (Kind.POLAR, Kind.PLANE, Kind.BEARING)) & (reason == 0)
