@@ -42,52 +42,76 @@ function fit() {
 }
 
 const RING_STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200];
-// Calls put(site, radius in NM) for every ring; the last one encloses the site's data.
-function eachRing(put) {
-  const step = RING_STEPS.find((s) => s * NM * view.scale >= 54) || 500;
-  for (const site of D.sites) for (let k = 1; k <= Math.min(Math.ceil(reach(site) / NM / step - 0.05), 400); k++) put(site, k * step);
+const ringStep = () => RING_STEPS.find((s) => s * NM * view.scale >= 54) || 500; // NM
+const mean = (values) => values.reduce((sum, v) => sum + v, 0) / values.length;
+
+// Sites that the eye takes for one at this scale: within a quarter of a ring step of each other.
+function siteGroups() {
+  const groups = [], near = 0.25 * ringStep() * NM;
+  for (const site of D.sites) {
+    const group = groups.find((g) => g.every((other) => Math.hypot(site.x - other.x, site.y - other.y) < near));
+    if (group) group.push(site);
+    else groups.push([site]);
+  }
+  return groups.map((sites) => ({ sites, x: mean(sites.map((s) => s.x)), y: mean(sites.map((s) => s.y)), reach: Math.max(...sites.map(reach)) }));
 }
 
-function drawRings(ctx) {
-  ctx.strokeStyle = D.sites.length > 3 ? "#eef1f4" : "#dce3e9";
+// Calls put(group of sites, radius in NM) for every ring; the last one encloses the group's data.
+function eachRing(groups, put) {
+  const step = ringStep();
+  for (const group of groups) for (let k = 1; k <= Math.min(Math.ceil(group.reach / NM / step - 0.05), 400); k++) put(group, k * step);
+}
+
+function drawRings(ctx, groups) {
+  ctx.strokeStyle = groups.length > 3 ? "#eef1f4" : "#dce3e9";
   ctx.lineWidth = 1;
-  eachRing((site, r) => {
+  eachRing(groups, (group, r) => {
     ctx.beginPath();
-    ctx.arc(sx(site.x), sy(site.y), r * NM * view.scale, 0, 2 * Math.PI);
+    ctx.arc(sx(group.x), sy(group.y), r * NM * view.scale, 0, 2 * Math.PI);
     ctx.stroke();
   });
 }
 
-function drawRingLabels(ctx) {
-  if (D.sites.length > 3) return;
+function drawRingLabels(ctx, groups) {
+  if (groups.length > 3) return;
+  const taken = [];
   ctx.font = "11px " + FONT;
   ctx.textAlign = "center";
   ctx.textBaseline = "middle";
-  eachRing((site, r) => {
+  eachRing(groups, (group, r) => {
     const name = `${+r.toFixed(1)} NM · ${+(r * 1.852).toFixed(r < 5 ? 1 : 0)} km`, d = r * NM * view.scale;
-    const x = sx(site.x) + d * 0.5, y = sy(site.y) + d * 0.866, w = ctx.measureText(name).width;
-    if (x - w / 2 > 3 && x + w / 2 < view.width - 3 && y > 8 && y < view.height - 8) halo(ctx, name, x, y, SOFT);
+    const x = sx(group.x) + d * 0.5, y = sy(group.y) + d * 0.866, w = ctx.measureText(name).width;
+    if (x - w / 2 < 3 || x + w / 2 > view.width - 3 || y < 8 || y > view.height - 8) return;
+    if (taken.some((b) => Math.abs(b.x - x) < (b.w + w) / 2 + 4 && Math.abs(b.y - y) < 14)) return;
+    taken.push({ x, y, w });
+    halo(ctx, name, x, y, SOFT);
   });
 }
 
-function drawSites(ctx) {
+function drawSites(ctx, groups) {
   ctx.font = "600 12px " + FONT;
   ctx.textAlign = "left";
   ctx.textBaseline = "bottom";
-  for (const site of D.sites) {
-    const x = sx(site.x), y = sy(site.y);
-    ctx.beginPath();
-    ctx.moveTo(x, y - 6);
-    ctx.lineTo(x + 5.5, y + 4);
-    ctx.lineTo(x - 5.5, y + 4);
-    ctx.closePath();
-    ctx.fillStyle = INK;
-    ctx.strokeStyle = "#fff";
-    ctx.lineWidth = 2.5;
-    ctx.stroke();
-    ctx.fill();
-    halo(ctx, site.name, x + 8, y - 3, INK);
+  for (const { sites, x: east, y: north } of groups) {
+    const apart = Math.max(...sites.map((s) => Math.hypot(s.x - east, s.y - north))) * view.scale > 7;
+    const marks = apart ? sites : [{ x: east, y: north }];
+    for (const mark of marks) triangle(ctx, sx(mark.x), sy(mark.y));
+    const x = Math.max(...marks.map((m) => sx(m.x)));
+    halo(ctx, sites.map((s) => s.name).join(", "), x + 8, sy(north) - 3, INK);
   }
+}
+
+function triangle(ctx, x, y) {
+  ctx.beginPath();
+  ctx.moveTo(x, y - 6);
+  ctx.lineTo(x + 5.5, y + 4);
+  ctx.lineTo(x - 5.5, y + 4);
+  ctx.closePath();
+  ctx.fillStyle = INK;
+  ctx.strokeStyle = "#fff";
+  ctx.lineWidth = 2.5;
+  ctx.stroke();
+  ctx.fill();
 }
 
 function halo(ctx, text, x, y, colour) {
@@ -305,13 +329,14 @@ painters.push(function paintMap() {
   if (resized && whole) { fit(); view.whole = true; }
   ctx.fillStyle = "#fff";
   ctx.fillRect(0, 0, view.width, view.height);
-  drawRings(ctx);
+  const groups = siteGroups();
+  drawRings(ctx, groups);
   drawPlots(ctx);
   drawTracks(ctx, TRACKS.filter(drawn), view.scale > 0.02 ? 2.2 : 1.5);
   drawGates(ctx);
   drawSelected(ctx);
-  drawRingLabels(ctx);
-  drawSites(ctx);
+  drawRingLabels(ctx, groups);
+  drawSites(ctx, groups);
   drawLabels(ctx);
   drawHover(ctx);
   drawFurniture(ctx);
