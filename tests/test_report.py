@@ -411,4 +411,6 @@ def test_sensors_in_time(tmp_path):
     assert 79.0 < high.min() < 82.0 and 118.0 < high.max() < 121.0
     assert "azimuth degraded, P 0.90" in page.text
     assert [tag for tag, a in page.elements if a.get("id") == "sensors"] == ["section"]
+    ticks = re.findall(r"<span>(\d\d:\d\d[:\d]*)</span>", page.text)
+    assert (ticks[0], ticks[3], ticks[-1]) == ("22:13:20", "22:14:38", "22:15:57")  # T0 is 22:13:20
     assert "Sensors in time" not in render(tmp_path, **scene()).text

@@ -14,6 +14,7 @@ __all__ = ["SensorRow", "sensor_rows"]
 
 _BINS = 160
 WIDTH, HEIGHT = 960.0, 44.0  # of a panel, in the picture's units
+_LONG = 7200.0  # s: over a longer time ticks are told to the nearest minute
 _LEAST_SCALE = 0.05  # share of faulty plots at the top of the panel, at least
 
 _Array = npt.NDArray[np.float64]
@@ -69,7 +70,8 @@ def _row(sensor: Health, begin: float, end: float) -> SensorRow:
     told = tuple(
         f"{_clock(d.time_from)} – {_clock(d.time_to)}: {d.condition}, P {d.probability:.2f}" for d in sensor.intervals
     )
-    ticks = tuple(_clock(float(t))[:5] for t in np.linspace(begin, end, 7))
+    places = np.linspace(begin, end, 7)
+    ticks = tuple(_clock(float(t)) if end - begin < _LONG else _clock(float(t) + 30.0)[:5] for t in places)
     return SensorRow(sensor.name, tuple(figures), tuple(series), f"{top:.0%}", told, ticks)
 
 
