@@ -240,6 +240,14 @@ def test_track_rows_sum_up_each_track():
     assert groups(updates.rows) == ([0], [1])
 
 
+def test_tracks_without_height_have_no_vertical_probability():
+    tracks = scene()["tracks"]
+    at = tracks.column_names.index("altitude")
+    tracks = tracks.set_column(at, "altitude", pa.array([3_000.0] * 40 + [None] * 40, pa.float64()))
+    flying, sailing = read_updates(tracks).rows
+    assert flying.max_v == 0.0 and np.isnan(sailing.max_v)
+
+
 def test_busiest_are_those_that_move():
     tracks = scene()["tracks"].drop(["p_manoeuvre_h", "speed_mps"])
     tracks = tracks.append_column("speed_mps", pa.array(np.repeat([0.1, 9.0], 40)))

@@ -11,7 +11,7 @@ from saltus.records import REASONS, Plots
 from saltus.report.columns import encode, numbers, quantise, texts
 from saltus.report.places import plane_about, plot_positions, project
 from saltus.report.tables import show
-from saltus.report.updates import Updates
+from saltus.report.updates import Updates, vertical_chance
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -177,7 +177,7 @@ def _tracks(
             "speed": encode(numbers(table, "speed_mps"), "f4"),
             "course": quantise(numbers(table, "course_deg"), 0.01, "u2"),
             "ph": quantise(numbers(table, "p_manoeuvre_h"), 0.004, "u1"),
-            "pv": quantise(numbers(table, "p_manoeuvre_v"), 0.004, "u1"),
+            "pv": quantise(vertical_chance(table), 0.004, "u1"),
             "status": encode(updates.status[keep], "u1"),
         },
         "gates": _gates(table, updates.time[keep], innovations, plane),

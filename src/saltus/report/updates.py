@@ -11,7 +11,7 @@ from saltus.report.columns import last_text_per_group, numbers, texts
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["TrackRow", "Updates", "groups", "read_updates"]
+__all__ = ["TrackRow", "Updates", "groups", "read_updates", "vertical_chance"]
 
 _STATUS = {"tentative": 0, "confirmed": 1, "coasted": 2}
 _COASTED = 2
@@ -70,6 +70,11 @@ def read_updates(tracks: "pa.Table") -> Updates:
     return Updates(tracks, track, np.append(starts, len(ids)), time, status, rows)
 
 
+def vertical_chance(tracks: "pa.Table") -> npt.NDArray[np.float64]:
+    """Return each row's probability of a vertical manoeuvre, NaN where no height was measured."""
+    return np.where(np.isfinite(numbers(tracks, "altitude")), numbers(tracks, "p_manoeuvre_v"), np.nan)
+
+
 def _rows(
     tracks: "pa.Table",
     ids: npt.NDArray[np.int64],
@@ -80,7 +85,7 @@ def _rows(
 ) -> tuple[TrackRow, ...]:
     if not len(ids):
         return ()
-    p_h, p_v = numbers(tracks, "p_manoeuvre_h"), numbers(tracks, "p_manoeuvre_v")
+    p_h, p_v = numbers(tracks, "p_manoeuvre_h"), vertical_chance(tracks)
     last = np.append(starts[1:], len(ids)) - 1
     measured = status != _COASTED
     speed = numbers(tracks, "speed_mps")
