@@ -4,6 +4,7 @@ import csv
 import html
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from saltus.identify import Conflict, Decisions, DecisionSettings, Episodes, Evidence, LocalTracks, join_evidence
+from saltus.records import Plots, Source, System
 from saltus.report import pairs
 from saltus.report.pairs import pair_rows, step_path, thinned_series, undecided
 from saltus.report.section import systems_section
@@ -160,6 +162,24 @@ def test_names_from_files_stay_text_and_one_system_has_no_section(tmp_path):
     alone = render(tmp_path, **scene())
     assert "systems" not in alone.data
     assert 'id="systems"' not in alone.text and '<th data-sort="t">Systems' not in alone.text
+
+
+def test_configured_names_are_what_people_read(tmp_path):
+    """The designation stands once, beside the name in the header; several sources of one system are one system."""
+    parts = scene()
+    biases = {"B": {"relative_to": "A", "common_objects": 1, "biases": {}, "not_estimated": {}}}
+    whole = replace(
+        found([(0, 2, [0.0], [0.7])], biases={"reference": "A", "systems": biases}), titles=("Airport", "Hill")
+    )
+    page = render(tmp_path, **parts, systems=whole, names={"CAT048:20/129": "Barcelona"})
+    assert page.data["sites"][0]["name"] == "Barcelona" and page.data["plots"]["sources"] == ["Barcelona"]
+    assert page.data["systems"]["names"] == ["Airport", "Hill"]
+    assert page.text.count("CAT048:20/129") == 1 and "Barcelona (CAT048:20/129)</p>" in page.text
+    assert "Airport is right by definition" in page.text and "<small>against Airport, " in page.text
+    assert "<dt>Systems</dt><dd>2 <small>1 source<" in page.text
+    boats = Plots.build(0, (Source(System(None, None, None, "eo")), Source(System(None, None, None, "ir"))), (), {})
+    page = render(tmp_path, **(parts | {"plots": boats}))
+    assert " · eo · ir</p>" in page.text and "<dt>Systems</dt><dd>1 <small>2 sources" in page.text
 
 
 def one_track(name, own):

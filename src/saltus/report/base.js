@@ -131,5 +131,5 @@ for (const track of TRACKS) {
   gaps.sort((a, b) => a - b);
   track.gap = gaps.length ? Math.max(gaps[gaps.length >> 1] * 3.5, 1) : 1;
   track.title = track.callsign || track.icao24 || "Track " + track.id;
-  track.text = ["track " + track.id, track.icao24, track.mode3a && "A" + track.mode3a].filter(Boolean).join(" · ");
+  track.text = [track.callsign || track.icao24 ? "track " + track.id : "", track.callsign && track.icao24, track.mode3a && "A" + track.mode3a].filter(Boolean).join(" · ");
 }

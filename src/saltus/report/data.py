@@ -31,6 +31,7 @@ def payload(
     assignments: "pa.Table",
     innovations: "pa.Table",
     sites: Mapping[str, "Site"],
+    names: Mapping[str, str],
 ) -> tuple[dict[str, object], list[str]]:
     """Return what the page's script reads, and notes on what the page leaves out.
 
@@ -39,13 +40,15 @@ def payload(
     """
     position = plot_positions(plots, sites)
     plane = plane_about(plots, position, updates.table, sites)
+    placed = [(names.get(key, key), site) for key, site in sites.items() if np.isfinite(site.latitude)]
     t0, t1 = time_span(plots, updates) or (0.0, 0.0)
     on_plots, plot_notes = _plots(plots, position, updates, assigned_tracks(plots, assignments), plane, t0)
     on_tracks, track_notes = _tracks(updates, innovations, plane, t0)
+    on_plots["sources"] = [names.get(str(s.system), str(s.system)) for s in plots.sources]
     drawn = {
         "t0": t0,
         "t1": t1,
-        "sites": [{"name": name, **_point(plane, site)} for name, site in sites.items() if np.isfinite(site.latitude)],
+        "sites": [{"name": name, **_point(plane, site)} for name, site in placed],
         "reasons": list(REASONS),
         "plots": on_plots,
         **on_tracks,
@@ -132,7 +135,6 @@ def _plots(
     reason = plots.reason[drawable]
     kind = np.where(reason != 0, 2, np.where(np.isfinite(track_id[drawable]), 0, 1))
     columns: dict[str, object] = {
-        "sources": [str(s.system) for s in plots.sources],
         "every": max(every, 1),
         "t": encode(plots.time[drawable] - t0, "f4"),
         "x": encode(xy[drawable, 0], "f4"),

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from saltus.io.write import output_file
-from saltus.records import Plots
+from saltus.records import Plots, System
 from saltus.report.colours import HEIGHT_ENDS, PROBABILITY_ENDS, colour_map
 from saltus.report.data import payload, rows_within, time_span
 from saltus.report.section import systems_section
 from saltus.report.sensors import HEIGHT, WIDTH, sensor_rows
 from saltus.report.systems import SystemsFound
-from saltus.report.tables import OUTSIDE, Block, blocks, innovation_rows, reason_rows, show, title
+from saltus.report.tables import OUTSIDE, Block, blocks, innovation_rows, reason_rows, show
 from saltus.report.updates import Updates, groups, read_updates
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ def write_report(
     sites: Mapping[str, "Site"],
     sensors: Sequence["Health"] = (),
     systems: SystemsFound | None = None,
+    names: Mapping[str, str] | None = None,
 ) -> None:
     """Write one self-contained HTML page; it needs no network and appears whole or not at all.
 
@@ -61,13 +62,15 @@ def write_report(
         sites: sensors' places by designation (`CAT048:20/129`) or name.
         sensors: faults of each sensor, for its timeline.
         systems: who is whom among several systems; None where there is one.
+        names: what people read for a system's designation, its name as configured; None: the designation.
 
     Raises:
         DataError: `path` is a directory.
         OSError: the page cannot be written.
     """
     updates = read_updates(rows_within(tracks, plots))
-    drawn, notes = payload(updates, plots, assignments, innovations, sites)
+    names = names or {}
+    drawn, notes = payload(updates, plots, assignments, innovations, sites, names)
     jumping, busiest = groups(updates.rows)
     drawn |= {
         "colours": {"p": colour_map(PROBABILITY_ENDS), "height": colour_map(HEIGHT_ENDS)},
@@ -86,8 +89,9 @@ def write_report(
         panel=(WIDTH, HEIGHT),
         found=section,
         index=index,
-        **_header(plots, assignments, updates, summary),
-        **_tables(updates, assignments, innovations, summary),
+        **_header(plots, assignments, updates, summary, names),
+        n_systems=len(systems.names) if systems else min(len(plots.sources), 1),
+        **_tables(updates, assignments, innovations, summary, names),
     )
     with output_file(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
@@ -122,11 +126,11 @@ def _script_json(value: object) -> object:
 
 
 def _header(
-    plots: Plots, assignments: "pa.Table", updates: Updates, summary: Mapping[str, object]
+    plots: Plots, assignments: "pa.Table", updates: Updates, summary: Mapping[str, object], names: Mapping[str, str]
 ) -> dict[str, object]:
     inputs = summary.get("inputs")
-    names = [Path(str(n)).name for n in inputs] if isinstance(inputs, Sequence) and not isinstance(inputs, str) else []
-    names = names or [Path(n).name for n in plots.files]
+    files = [Path(str(n)).name for n in inputs] if isinstance(inputs, Sequence) and not isinstance(inputs, str) else []
+    files = files or [Path(n).name for n in plots.files]
     counts = reason_rows(assignments)
     read, outside = sum(n for _, n, _ in counts), sum(n for name, n, _ in counts if name == OUTSIDE)
     used, judged = counts[0][1] if counts else 0, read - outside
@@ -137,21 +141,31 @@ def _header(
         ("On a track", show(used), f"{used / judged:.1%}" if judged else ""),
         ("Rejected or unused", show(judged - used), f"{(judged - used) / judged:.1%}" if judged else ""),
         ("Confirmed tracks", show(n_confirmed), ""),
-        ("Systems", show(len(plots.sources)), ""),
     ]
     span = time_span(plots, updates)
     return {
-        "heading": ", ".join(names) if 0 < len(names) <= 2 else f"{len(names)} recordings" if names else "No recording",
-        "inputs": names,
-        "systems": [f"{s.system} {s.system.name}".strip() for s in plots.sources],
+        "heading": ", ".join(files) if 0 < len(files) <= 2 else f"{len(files)} recordings" if files else "No recording",
+        "inputs": files,
+        "sources": [_designated(s.system, names) for s in plots.sources],
         "span": _span(*span) if span else "",
         "figures": figures,
         "version": version("saltus"),
     }
 
 
+def _designated(system: System, names: Mapping[str, str]) -> str:
+    """Write a system's name and its designation, once where they are the same."""
+    designation = str(system)
+    name = names.get(designation, system.name) or designation
+    return name if designation in name else f"{name} ({designation})"
+
+
 def _tables(
-    updates: Updates, assignments: "pa.Table", innovations: "pa.Table", summary: Mapping[str, object]
+    updates: Updates,
+    assignments: "pa.Table",
+    innovations: "pa.Table",
+    summary: Mapping[str, object],
+    names: Mapping[str, str],
 ) -> dict[str, object]:
     confirmed = [row for row in updates.rows if row.confirmed]
     problems = summary.get("problems") or ()
@@ -162,12 +176,11 @@ def _tables(
     return {
         "reasons": reason_rows(assignments),
         "noise": blocks("noise", summary["noise"]) if summary.get("noise") else [],
-        "innovations": innovation_rows(innovations),
+        "innovations": [r._replace(source=names.get(r.source, r.source)) for r in innovation_rows(innovations)],
         "rows": confirmed[:MAX_ROWS],
         "n_confirmed": len(confirmed),
         "problems": [problems] if isinstance(problems, str) else [show(p) for p in _listed(problems)],
         "run": run,
-        "title": title,
     }
 
 

@@ -158,7 +158,7 @@ def pair_payload(found: SystemsFound, series: list[Series], index: dict[int, int
     ends = pairs[[x.pair for x in series]] if series else np.zeros((0, 2), np.int64)
     join = np.concatenate if series else (lambda _: np.zeros(0))
     return {
-        "names": list(found.names),
+        "names": list(found.titles),
         "colours": system_colours(len(found.names)),
         "local": [list(named(found, k)) for k in range(len(found.system))],
         "members": {

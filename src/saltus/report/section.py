@@ -22,8 +22,9 @@ __all__ = ["Section", "systems_section"]
 class Section(NamedTuple):
     """What the template shows of several systems."""
 
-    names: tuple[str, ...]
-    titles: tuple[str, ...]
+    names: tuple[str, ...]  # designations
+    titles: tuple[str, ...]  # what people read
+    title_of: dict[str, str]
     colours: list[str]
     matrix: list[SystemRow]
     reference: str
@@ -54,6 +55,7 @@ def systems_section(
     section = Section(
         names=found.names,
         titles=found.titles,
+        title_of=dict(zip(found.names, found.titles, strict=True)),
         colours=system_colours(len(found.names)),
         matrix=system_rows(found),
         reference=str(found.biases.get("reference", "")),

@@ -82,7 +82,8 @@ def track_files(
         tracks, gates = _tables(tracked, plots, config)
         assigned = assignment_table(plots, tracked.measurements, tracked.assignments)
         done = time.perf_counter()
-        problems += conflict_lines(whole)
+        called = _called(plots.sources, sensors.names)
+        problems += conflict_lines(whole, called)
         summary = summarise(inputs, plots, sensors, tracked, tracks, assigned, problems)
         summary["systems"] = identification_summary(whole)
         summary["settings"] = {
@@ -105,7 +106,8 @@ def track_files(
                 summary={**summary, "noise": noise_rows(summary)},
                 sites=sites,
                 sensors=health_of(sensors, tracked),
-                systems=systems_found(whole, config.systems, titles),
+                systems=systems_found(whole, config.systems, called),
+                names=called,
             )
     show_summary(summary, output, report, system_lines(whole, titles))
     return summary
@@ -189,13 +191,22 @@ def _prepare(
             problems.append(_site_wanted(source, int(needs.sum())))
         if (reason[plots.source == s] == 0).any() and np.isnan(sensors.told_periods[s]):
             problems.append(
-                f"{source.system}: the recording does not tell the update period; {_NO_PERIOD} s is assumed. "
+                f"{sensors.names[s]}: the recording does not tell the update period; {_NO_PERIOD} s is assumed. "
                 "Give period (s) in its [[sensor]] table."
             )
     plots = replace(plots, reason=reason)
     if not (reason == 0).any():
         raise DataError(_nothing_left(plots, problems))
     return plots, sensors, problems
+
+
+def _called(sources: Sequence[Source], names: Sequence[str]) -> dict[str, str]:
+    """Return what people read for each designation: the name as configured, told apart where two are the same."""
+    called: dict[str, str] = {}
+    for source, name in zip(sources, names, strict=True):
+        system = str(source.system)
+        called[system] = f"{name} ({system})" if name in called.values() else name
+    return called
 
 
 def _site_wanted(source: Source, count: int) -> str:

@@ -122,9 +122,14 @@ def identification_summary(whole: Identified) -> dict[str, Any]:
     return out
 
 
-def conflict_lines(whole: Identified) -> list[str]:
-    """Say which identities contradict each other, the longest first; none is resolved silently."""
-    names = np.repeat([x.name for x in whole.systems], [len(x.ids) for x in whole.systems])
+def conflict_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
+    """Say which identities contradict each other, the longest first; none is resolved silently.
+
+    Args:
+        whole: who is whom.
+        titles: what people read for a system's name.
+    """
+    names = np.repeat([titles.get(x.name, x.name) for x in whole.systems], [len(x.ids) for x in whole.systems])
     labels = [label for x in whole.systems for label in x.local_id]
 
     def named(k: int) -> str:
