@@ -4,7 +4,7 @@ import base64
 import json
 import os
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -15,8 +15,11 @@ from saltus.geo import Site
 from saltus.records import REASONS, Kind, Plots, Source, System
 from saltus.report import colours, data, tables, write_report
 from saltus.report.sensors import HEIGHT, WIDTH
+from saltus.report.settings import UNITS
 from saltus.report.updates import groups, read_updates
 from saltus.tracks.health import Degraded, Health
+from saltus.tracks.registration import RegistrationSettings
+from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
 
 T0 = 1_700_000_000.0
 SITE = Site(np.radians(41.3), np.radians(2.1), 27.3, 0.0)
@@ -382,6 +385,20 @@ def test_any_summary_becomes_tables():
     assert mixed[1].rows == (("Probability", "0.999"), ("Keep", "yes"))
     assert tables.blocks("runs", [{"a": 1}, {"b": 2.0}])[0].rows == (("1", "–"), ("–", "2"))
     assert tables.blocks("n", 12_345)[0].rows == (("12\u202f345",),)
+
+
+def test_run_has_dates_and_units(tmp_path):
+    kinds = {"tracker": TrackerSettings, "filter": FilterSettings, "systems": SystemsSettings}
+    kinds |= {"registration": RegistrationSettings}
+    for group, units in UNITS.items():
+        assert set(units) <= {field.name for field in fields(kinds[group])}
+    chosen = {"tracker": {"max_speed": 400.0, "coast_seconds": 20.0}, "filter": {"accel_h": (0.15, 3.0)}}
+    summary = {"time_from": T0, "time_to": None, "settings": {"identity": "use", **chosen}}
+    text = render(tmp_path, **scene(), summary=summary).text
+    assert "<td>2023-11-14 22:13:20 UTC</td>" in text
+    assert '<td>Max speed, m/s</td><td class="n">400</td>' in text
+    assert '<td>Acceleration horizontal, m/s²</td><td class="n">0.15, 3</td>' in text
+    assert "<td>Coast, s</td>" in text
 
 
 def test_colours_are_even_steps_that_darken():

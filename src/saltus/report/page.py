@@ -16,6 +16,7 @@ from saltus.report.colours import HEIGHT_ENDS, PROBABILITY_ENDS, colour_map
 from saltus.report.data import payload, rows_within, time_span
 from saltus.report.section import systems_section
 from saltus.report.sensors import HEIGHT, WIDTH, sensor_rows
+from saltus.report.settings import readable
 from saltus.report.systems import SystemsFound
 from saltus.report.tables import OUTSIDE, Block, blocks, innovation_rows, reason_rows, show
 from saltus.report.updates import Updates, groups, read_updates
@@ -170,7 +171,7 @@ def _tables(
     confirmed = [row for row in updates.rows if row.confirmed]
     problems = summary.get("problems") or ()
     run: list[Block] = []
-    for key, value in summary.items():
+    for key, value in readable(summary).items():
         if key not in _PLACED:
             run += blocks(str(key), value)
     return {

@@ -21,6 +21,10 @@ _UNITS = {"m": "m", "deg": "°", "s": "s", "mps": "m/s", "mps2": "m/s²", "m2": 
     "percent": "%",
     "mb": "MB",
     "bytes": "bytes",
+    "degps": "°/s",
+    "nats": "nats",
+    "perm2": "per m² and scan",
+    "perrad": "per rad and scan",
 }
 _WORDS = {"sigma": "σ", "nis": "NIS", "dof": "degrees of freedom", "probs": "probabilities", "n": "number of"} | {
     "imm": "IMM",
@@ -30,6 +34,10 @@ _WORDS = {"sigma": "σ", "nis": "NIS", "dof": "degrees of freedom", "probs": "pr
     "id": "id",
     "lsb": "LSB",
     "std": "standard deviation",
+    "accel": "acceleration",
+    "h": "horizontal",
+    "v": "vertical",
+    "xy": "position",
 }
 
 
