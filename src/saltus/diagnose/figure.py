@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,9 @@ from saltus.diagnose.fit import NoiseFit
 from saltus.diagnose.likelihood import Series, pack
 from saltus.diagnose.residuals import Residuals
 from saltus.studies.style import BLUE, GREY, INK, ORANGE, TEAL, new_figure, save
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["autocovariance", "draw_noise"]
 
@@ -27,11 +31,8 @@ def draw_noise(path: Path, found: Residuals, fits: Mapping[str, NoiseFit]) -> No
             there = np.isfinite(found.values[:, row])
             data = pack(found.times[there], found.values[there, row], found.labels[there])
             left, right = panels[row]
-            for k, colour in zip(range(min(_SHOWN, len(data.r))), (BLUE, ORANGE, TEAL), strict=False):
-                left.plot(data.t[k] - data.t[k, 0], data.r[k], ".", ms=2.2, color=colour)
-            left.axhline(fit.bias, color=GREY, lw=1)
             span = 6 * np.hypot(fit.sigma.value, fit.white.value)
-            left.set_ylim(fit.bias - span, fit.bias + span)
+            _draw_series(left, data, fit.bias, span)
             left.set_ylabel(f"{name}{unit}")
             lags, cov = autocovariance(data, fit.bias, min(5 * fit.tau.value, 400 * fit.interval), span)
             right.plot(lags, cov, "o", ms=3.4, color=INK, label="data")
@@ -41,12 +42,30 @@ def draw_noise(path: Path, found: Residuals, fits: Mapping[str, NoiseFit]) -> No
                        label="white part")  # fmt: skip
             right.axhline(0.0, color=GREY, lw=1)
             right.set_ylabel(f"autocovariance{unit + '²' if unit else ''}")
-        panels[0, 0].set_title(f"the {min(_SHOWN, fit.n_series)} longest series", fontsize=10, fontweight="normal")
+        longest = f"the {min(_SHOWN, fit.n_series)} longest series" if fit.n_series > 1 else "the series"
+        panels[0, 0].set_title(longest, fontsize=10, fontweight="normal")
         panels[0, 1].set_title("all series", fontsize=10, fontweight="normal")
         panels[-1, 0].set_xlabel("time since the first report, s")
         panels[-1, 1].set_xlabel("lag, s")
         figure.legend(*panels[0, 1].get_legend_handles_labels(), loc="outside lower left", ncols=3)
         save(figure, path)
+
+
+def _draw_series(axes: "Axes", data: Series, bias: float, span: float) -> None:
+    """Draw the longest series against time; what lies further than `span` from the bias as triangles at the edge."""
+    beyond = 0
+    for k, colour in zip(range(min(_SHOWN, len(data.r))), (BLUE, ORANGE, TEAL), strict=False):
+        t, off = data.t[k] - data.t[k, 0], data.r[k] - bias
+        inside = np.abs(off) <= span
+        axes.plot(t[inside], bias + off[inside], ".", ms=2.2, color=colour)
+        for mark, far, edge in (("^", off > span, span), ("v", off < -span, -span)):
+            axes.plot(t[far], np.full(np.count_nonzero(far), bias + edge), mark, ms=4, color=colour)
+            beyond += int(np.count_nonzero(far))
+    axes.axhline(bias, color=GREY, lw=1)
+    axes.set_ylim(bias - 1.06 * span, bias + 1.06 * span)
+    if beyond:
+        words = f"▲▼ beyond 6σ: {beyond}"
+        axes.set_title(words, loc="right", fontsize=8.5, fontweight="normal", color=GREY)
 
 
 def autocovariance(
