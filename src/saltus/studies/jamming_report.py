@@ -106,7 +106,7 @@ def _draw(path: Path, trial: Trial) -> None:
                 time, rms[i], color=colour, label=("adaptive", "told the faults", "never heard of faults")[i]
             )
         panels[0].set_yscale("log")
-        panels[0].set_ylim(20, 5e4)
+        panels[0].set_ylim(20, 2 * rms.max())
         panels[0].set_ylabel("position error (RMS), m")
         for first, name in zip(FIRST, FAULTS, strict=True):
             at = PERIOD * (first + LENGTH / 2)
@@ -115,13 +115,13 @@ def _draw(path: Path, trial: Trial) -> None:
             )
         mean = trial.prob.mean(axis=0)
         radar, beacon = mean.sum(axis=2), mean.sum(axis=1)
-        for state, (colour, line) in enumerate(((BLUE, "-"), (ORANGE, "-"), (TEAL, "-")), start=1):
-            panels[1].plot(time, radar[:, state], line, color=colour, label=("jammed", "biased", "lost")[state - 1])
+        for state, (line, name) in enumerate((("-", "jammed"), ("--", "biased"), (":", "lost")), start=1):
+            panels[1].plot(time, radar[:, state], line, color=BLUE, label=name)  # the colour is the filter's
         panels[2].plot(time, beacon[:, 1], color=BLUE, label="jammed")
         for axes, what, place in ((panels[1], "radar", "center right"), (panels[2], "beacon", "center left")):
-            axes.set_ylim(0, 1)
+            axes.set_ylim(-0.02, 1.04)  # curves at 0 and 1 are seen whole
             axes.set_yticks([0, 0.5, 1])
-            axes.set_ylabel(f"P, {what}")
+            axes.set_ylabel(f"P, {what}\n(adaptive)")
             axes.legend(*_curves(axes.get_legend_handles_labels()), loc=place)
         panels[2].set_xlabel("time, s")
         panels[2].set_xlim(0, time[-1])
