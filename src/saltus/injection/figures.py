@@ -15,6 +15,7 @@ __all__ = ["RUNS", "draw", "errors", "found", "growth"]
 
 RUNS = ("clean_with", "clean_without", "injected_with", "injected_without")  # with or without the chains of faults
 _MIN_TRACK, _MIN_SPEED = 5, 100.0  # plots of a track, kt
+_LEAST, _MOST = 1e-6, 1 - 1e-8  # probabilities beyond are drawn in a row of their own
 _MANY, _OFTEN = 100, 0.05  # plots of an aircraft, share of them suspected
 
 _Array = npt.NDArray[np.float64]
@@ -145,12 +146,13 @@ def draw(
                 alpha=0.25 if small else 0.9,
                 label=label,
             )
-        ticks = np.array([1e-6, 1e-4, 1e-2, 0.5, 1 - 1e-2, 1 - 1e-4, 1 - 1e-6])
-        axes.set_yticks(_log_odds(ticks), ["1e-6", "1e-4", "0.01", "0.5", "0.99", "1 − 1e-4", "1 − 1e-6"])
-        axes.set_ylim(_log_odds(ticks[:1])[0] - 1, _log_odds(ticks[-1:])[0] + 2)
+        ticks = np.array([_LEAST, 1e-4, 1e-2, 0.5, 1 - 1e-2, 1 - 1e-4, 1 - 1e-6, _MOST])
+        names = ["≤ 1e-6", "1e-4", "0.01", "0.5", "0.99", "1 − 1e-4", "1 − 1e-6", "≥ 1 − 1e-8"]
+        axes.set_yticks(_log_odds(ticks), names)
+        axes.set_ylim(_log_odds(ticks[:1])[0] - 1, _log_odds(ticks[-1:])[0] + 1)
         axes.set_xlabel("range, km")
         axes.set_ylabel("p_fault")
-        axes.legend(loc="center right", markerscale=2)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower left", ncols=3, markerscale=2)
         save(figure, folder / "figure2_p_fault.png")
 
 
@@ -163,7 +165,7 @@ _PANELS = {
 
 
 def _log_odds(p: _Array) -> _Array:
-    p = np.clip(p, 3e-7, 1 - 3e-7)
+    p = np.clip(p, _LEAST, _MOST)
     return np.asarray(np.log(p / (1.0 - p)))
 
 
