@@ -102,7 +102,7 @@ def _orders(path: Path, outcomes: dict[str, Outcome]) -> None:
             axes.axhline(outcome.filters["grid_coarse"].mean_err, color=GREY, lw=1.0, label="coarse grid")
             axes.set_yscale("log")
             axes.set_xticks([2, 3, 4, 6])
-            axes.set_title(name)
+            axes.set_title(_TITLES[name], fontsize=9)
             axes.set_xlabel("order")
         panels.flat[-1].set_axis_off()
         panels.flat[-1].legend(*panels.flat[0].get_legend_handles_labels(), loc="center", frameon=False)
