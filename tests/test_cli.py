@@ -170,7 +170,7 @@ def test_a_site_that_is_missing_is_named_with_what_to_write(recording, tmp_path)
         (["--from", "half past ten"], ["half past ten", "HH:MM"]),
         (["--to", "25:00"], ["25:00", "HH:MM"]),
         (["--from", "12:00"], ["outside time window"]),  # after the recording's end
-        (["--from", "10:00:30", "--to", "10:00:10"], ["outside time window"]),
+        (["--from", "10:00:30", "--to", "10:00:10"], ["--from 10:00:30 is after --to 10:00:10"]),
     ],
 )
 def test_times_and_dates_that_cannot_be(recording, tmp_path, arguments, words):
