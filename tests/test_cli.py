@@ -154,6 +154,29 @@ def test_an_output_directory_that_is_a_file(recording, tmp_path):
     assert (tmp_path / "out").read_text() == "mine"
 
 
+@pytest.mark.parametrize("output", ["", "/"])
+def test_an_output_without_a_name(recording, output):
+    path, config = recording
+    result = saltus("track", path, "-o", output, "--config", config)
+    assert result.exit_code == 2
+    assert ("name is empty" if output == "" else "root of the file system") in result.stderr
+
+
+def test_an_output_inside_a_file(recording, tmp_path):
+    path, config = recording
+    (tmp_path / "afile").write_text("mine")
+    assert "afile is a file" in refused("track", path, "-o", tmp_path / "afile" / "x", "--config", config)
+
+
+def test_a_report_of_an_earlier_run_does_not_stay_beside_new_results(recording, tmp_path):
+    path, config = recording
+    assert saltus("track", path, "-o", tmp_path / "out", "--config", config).exit_code == 0
+    assert (tmp_path / "out" / "report.html").exists()
+    assert saltus("track", path, "-o", tmp_path / "out", "--config", config, "--no-report").exit_code == 0
+    assert (tmp_path / "out" / "tracks.parquet").exists()
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
 def test_a_site_that_is_missing_is_named_with_what_to_write(recording, tmp_path):
     path, _ = recording
     line = refused("track", path, "-o", tmp_path / "out", "--date", "2025-06-01")

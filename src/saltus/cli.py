@@ -1,5 +1,6 @@
 """The program `saltus`: each command is one function elsewhere, imported when it runs."""
 
+import os
 import sys
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,16 @@ from saltus.errors import SaltusError
 
 __all__ = ["main"]
 
-_FILE = click.Path(path_type=Path)
+
+class _Path(click.Path):
+    def convert(self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Refuse an empty name, which pathlib takes for the current directory."""
+        if value == "":
+            self.fail("the name is empty.", param, ctx)
+        return Path(value)
+
+
+_FILE = _Path()
 
 
 class _Group(click.Group):

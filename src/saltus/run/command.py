@@ -38,6 +38,7 @@ __all__ = ["parse_time", "track_files", "track_recording"]
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 _DAY = 86400.0  # s
 _ADSB, _PARKED = 21, 5.0  # s: category, and how seldom a transponder at rest on the ground tells its position
+_REPORT = "report.html"
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
 
 
@@ -62,7 +63,7 @@ def track_files(
         identity: "use" or "ignore" the codes that plots carry.
         time_from: first time used, HH:MM[:SS] of the recording's day or ISO 8601, UTC.
         time_to: last time used.
-        report: whether to write the report.
+        report: whether to write the report; without it, the report of an earlier run is removed.
 
     Returns:
         The summary, as written.
@@ -74,7 +75,7 @@ def track_files(
     began = time.perf_counter()
     config = load_config(config_path)
     day = parse_date(date_text) if date_text else config.date
-    with progress_bar() as bar, output_directory(output) as folder:
+    with progress_bar() as bar, output_directory(output, () if report else (_REPORT,)) as folder:
         recording = io.read(inputs, date=day, editions=config.editions, progress=bar.reading)
         decoded = time.perf_counter()
         plots, sensors, problems = _prepare(recording, config, time_from, time_to)
@@ -98,7 +99,7 @@ def track_files(
 
             sites = {str(s.system): site for s, site in zip(plots.sources, sensors.sites, strict=True) if site}
             write_report(
-                folder / "report.html",
+                folder / _REPORT,
                 tracks=tracks,
                 plots=plots,
                 assignments=assigned,
