@@ -1,5 +1,6 @@
 """The program on the command line: versions, help, and one clear line for what cannot be."""
 
+import os
 import subprocess
 import sys
 import tomllib
@@ -122,6 +123,37 @@ def test_a_file_that_is_not_there(tmp_path):
     assert "absent.toml" in refused(
         "track", tmp_path / "a.ast", "-o", tmp_path / "o", "--config", tmp_path / "absent.toml"
     )
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (FileNotFoundError("a.parquet"), "no such file: a.parquet"),
+        (PermissionError("a.parquet"), "permission denied: a.parquet"),
+        (OSError("a.parquet"), "reading or writing failed: a.parquet"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (OSError(28, "No space left on device", "a"), "No space left on device: a"),
+    ],
+)
+def test_a_failure_of_the_system_says_what_happened(monkeypatch, error, words):
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr("saltus.info.show_info", fails)
+    assert refused("info", "x") == f"saltus: {words}"
+
+
+def test_a_reader_that_has_enough_ends_the_program_quietly(recording, tmp_path):
+    """The pipe is closed before the program says anything."""
+    path, config = recording
+    read, write = os.pipe()
+    os.close(read)
+    arguments = ["track", path, "-o", tmp_path / "out", "--config", config, "--no-report"]
+    code = "from saltus.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", code, *arguments], stdout=write, stderr=subprocess.PIPE, text=True)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "tracks.parquet").exists()
 
 
 def test_an_empty_file(tmp_path):

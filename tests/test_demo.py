@@ -218,3 +218,14 @@ def test_the_demonstration_tracks_what_it_simulates(tmp_path, monkeypatch, capsy
         assert share > 95.0
         assert rmse < 150.0  # the plots' own error reaches 120 m across the ray at 100 km and more
     assert "False confirmed tracks:" in printed
+
+
+def test_an_interrupted_demonstration_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("saltus.demo.DURATION", 20.0)
+    monkeypatch.setattr("saltus.run.write_tracks", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_demo(tmp_path / "out", seed=1)
+    assert list(tmp_path.iterdir()) == []

@@ -31,13 +31,25 @@ class _Group(click.Group):
         except SaltusError as error:
             click.echo(f"saltus: {error}", err=True)
             sys.exit(2)
+        except BrokenPipeError:
+            # Whoever read the output has closed it, as head does. Commands write their files before they say so.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            sys.exit(0)
         except OSError as error:
-            named = f": {error.filename}" if error.filename is not None else ""
-            click.echo(f"saltus: {error.strerror or error}{named}", err=True)
+            click.echo(f"saltus: {_said(error)}", err=True)
             sys.exit(2)
         except KeyboardInterrupt:
             click.echo("saltus: interrupted; nothing half-written was left", err=True)
             sys.exit(130)
+
+
+def _said(error: OSError) -> str:
+    """What happened, and to which file; libraries raise some with nothing but a path."""
+    if error.strerror is None:
+        kinds = {FileNotFoundError: "no such file", PermissionError: "permission denied"}
+        what = next((text for kind, text in kinds.items() if isinstance(error, kind)), "reading or writing failed")
+        return f"{what}: {error}"
+    return error.strerror if error.filename is None else f"{error.strerror}: {error.filename}"
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})

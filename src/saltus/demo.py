@@ -49,7 +49,8 @@ def run_demo(output: Path, seed: int) -> None:
     """Simulate a scene into OUTPUT, track it as any recording, print how well that went.
 
     Args:
-        output: directory for radar_a.ast, radar_b.ast, sensors.toml, truth.parquet and the tracker's results.
+        output: directory for radar_a.ast, radar_b.ast, sensors.toml, truth.parquet and the tracker's results, which
+            appear together.
         seed: of the noise, the misses and the clutter.
 
     Raises:
@@ -57,12 +58,16 @@ def run_demo(output: Path, seed: int) -> None:
     """
     from rich.console import Console
 
-    from saltus.run import track_files
+    from saltus.progress import progress_bar
+    from saltus.run import write_tracks
+    from saltus.summary import show_summary
 
     console = Console(highlight=False)
     console.print(f"Two radars, {len(demo_aircraft())} aircraft, {DURATION / 60:.0f} minutes, seed {seed}.")
-    simulated = write_demo(output, seed)
-    track_files(simulated.files, output, simulated.config, None, "use", None, None, report=True)
+    with progress_bar() as bar, output_directory(output) as folder:
+        simulated = write_demo(folder, seed)
+        summary, lines = write_tracks(simulated.files, folder, bar, simulated.config)
+    show_summary(summary, output, True, lines)
     tracks = pq.read_table(output / "tracks.parquet")
     score = score_demo(tracks, pq.read_table(output / "assignments.parquet"), simulated.labels)
     console.print(_table(score))

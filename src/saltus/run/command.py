@@ -33,7 +33,7 @@ from saltus.summary import Sensors, Tracked, health_of, noise_rows, show_summary
 from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.rows import Rows, join_rows
 
-__all__ = ["parse_time", "track_files", "track_recording"]
+__all__ = ["parse_time", "track_files", "track_recording", "write_tracks"]
 
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 _DAY = 86400.0  # s
@@ -72,46 +72,66 @@ def track_files(
         DataError: an input cannot be read, or nothing in it can be tracked.
         ModelError: the configuration is wrong.
     """
+    with progress_bar() as bar, output_directory(output, () if report else (_REPORT,)) as folder:
+        summary, lines = write_tracks(inputs, folder, bar, config_path, date_text, identity, time_from, time_to, report)
+    show_summary(summary, output, report, lines)
+    return summary
+
+
+def write_tracks(
+    inputs: Sequence[Path],
+    folder: Path,
+    bar: Progress,
+    config_path: Path | None = None,
+    date_text: str | None = None,
+    identity: str = "use",
+    time_from: str | None = None,
+    time_to: str | None = None,
+    report: bool = True,
+) -> tuple[dict[str, object], Sequence[str]]:
+    """Track recordings as `track_files` does, into a folder whose files another has yet to publish.
+
+    Returns:
+        The summary, and lines on what the systems have in common: `show_summary` says both.
+    """
     began = time.perf_counter()
     config = load_config(config_path)
     day = parse_date(date_text) if date_text else config.date
-    with progress_bar() as bar, output_directory(output, () if report else (_REPORT,)) as folder:
-        recording = io.read(inputs, date=day, editions=config.editions, progress=bar.reading)
-        decoded = time.perf_counter()
-        plots, sensors, problems = _prepare(recording, config, time_from, time_to)
-        tracked, whole = track_plots(plots, recording.tracks, sensors, config, bar, use_identity=identity == "use")
-        tracks, gates = _tables(tracked, plots, config)
-        assigned = assignment_table(plots, tracked.measurements, tracked.assignments)
-        done = time.perf_counter()
-        called = _called(plots.sources, sensors.names)
-        problems += conflict_lines(whole, called)
-        summary = summarise(inputs, plots, sensors, tracked, tracks, assigned, problems)
-        summary["systems"] = identification_summary(whole)
-        summary["settings"] = {
-            "identity": identity,
-            **{name: asdict(getattr(config, name)) for name in ("tracker", "filter", "systems", "registration")},
-        }
-        summary["seconds"] = {"decoding": round(decoded - began, 2), "tracking": round(done - decoded, 2)}
-        titles = {str(s.system): name for s, name in zip(plots.sources, sensors.names, strict=True)}
-        _write(folder, tracks, assigned, whole, summary)
-        if report:
-            from saltus.report import write_report
+    recording = io.read(inputs, date=day, editions=config.editions, progress=bar.reading)
+    decoded = time.perf_counter()
+    plots, sensors, problems = _prepare(recording, config, time_from, time_to)
+    tracked, whole = track_plots(plots, recording.tracks, sensors, config, bar, use_identity=identity == "use")
+    tracks, gates = _tables(tracked, plots, config)
+    assigned = assignment_table(plots, tracked.measurements, tracked.assignments)
+    done = time.perf_counter()
+    called = _called(plots.sources, sensors.names)
+    problems += conflict_lines(whole, called)
+    summary = summarise(inputs, plots, sensors, tracked, tracks, assigned, problems)
+    summary["systems"] = identification_summary(whole)
+    summary["settings"] = {
+        "identity": identity,
+        **{name: asdict(getattr(config, name)) for name in ("tracker", "filter", "systems", "registration")},
+    }
+    summary["seconds"] = {"decoding": round(decoded - began, 2), "tracking": round(done - decoded, 2)}
+    titles = {str(s.system): name for s, name in zip(plots.sources, sensors.names, strict=True)}
+    _write(folder, tracks, assigned, whole, summary)
+    if report:
+        from saltus.report import write_report
 
-            sites = {str(s.system): site for s, site in zip(plots.sources, sensors.sites, strict=True) if site}
-            write_report(
-                folder / _REPORT,
-                tracks=tracks,
-                plots=plots,
-                assignments=assigned,
-                innovations=gates,
-                summary={**summary, "noise": noise_rows(summary)},
-                sites=sites,
-                sensors=health_of(sensors, tracked),
-                systems=systems_found(whole, config.systems, called),
-                names=called,
-            )
-    show_summary(summary, output, report, system_lines(whole, titles))
-    return summary
+        sites = {str(s.system): site for s, site in zip(plots.sources, sensors.sites, strict=True) if site}
+        write_report(
+            folder / _REPORT,
+            tracks=tracks,
+            plots=plots,
+            assignments=assigned,
+            innovations=gates,
+            summary={**summary, "noise": noise_rows(summary)},
+            sites=sites,
+            sensors=health_of(sensors, tracked),
+            systems=systems_found(whole, config.systems, called),
+            names=called,
+        )
+    return summary, system_lines(whole, titles)
 
 
 def track_recording(
