@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from saltus.cli import main
+from saltus.errors import DataError
 from saltus.score import score_files
 
 START = 1.7e9
@@ -245,16 +246,72 @@ def test_what_cannot_be_scored_is_one_line(tmp_path):
         (text,) = result.stderr.splitlines()
         return text
 
-    assert "tracks.parquet" in said(tmp_path, tmp_path / "truth.parquet")
+    assert "OUTPUT is a folder that saltus track wrote" in said(tmp_path, tmp_path / "truth.parquet")
     pq.write_table(pa.table(tracks((1, T, east, north))), tmp_path / "tracks.parquet")
     del good["target_id"]
     pq.write_table(pa.table(good), tmp_path / "truth.parquet")
     assert "no column 'target_id'" in said(tmp_path, tmp_path / "truth.parquet")
     good["target_id"], good["time"] = ["a"] * len(T), ["noon"] * len(T)
     pq.write_table(pa.table(good), tmp_path / "truth.parquet")
-    assert "column 'time' is of type string" in said(tmp_path, tmp_path / "truth.parquet")
-    good["time"] = np.full(len(T), np.nan)
+    assert "row 0, column 'time': 'noon' is no number" in said(tmp_path, tmp_path / "truth.parquet")
+    good["time"] = [[1.0]] * len(T)
     pq.write_table(pa.table(good), tmp_path / "truth.parquet")
-    assert "no row gives time" in said(tmp_path, tmp_path / "truth.parquet")
+    assert "column 'time' is of type list" in said(tmp_path, tmp_path / "truth.parquet")
+    pq.write_table(pa.table(truth(("a", T, east, north))).slice(0, 0), tmp_path / "truth.parquet")
+    assert "no row" in said(tmp_path, tmp_path / "truth.parquet")
+    assert "absent.parquet: no such file" in said(tmp_path, tmp_path / "absent.parquet")
+    (tmp_path / "ragged.csv").write_text("time,target_id,latitude,longitude\n1,a,2,3\n4,a,5\n")
+    assert "row 1 has 3 cells where the header has 4" in said(tmp_path, tmp_path / "ragged.csv")
+    (tmp_path / "empty.csv").write_text("")
+    assert "it is empty" in said(tmp_path, tmp_path / "empty.csv")
     (tmp_path / "truth.parquet").write_bytes(b"nothing")
     assert "no readable table" in said(tmp_path, tmp_path / "truth.parquet")
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("latitude", 412.0, "row 3, column 'latitude': 412 cannot be (degrees north, -90 to 90)"),
+        ("longitude", -181.0, "row 3, column 'longitude': -181 cannot be"),
+        ("time", 1.7e12, "row 3, column 'time': 1.7e+12 cannot be (seconds since 1970-01-01, UTC"),
+        ("latitude", np.nan, "row 3, column 'latitude': no value"),
+        ("latitude", "north", "row 3, column 'latitude': 'north' is no number"),
+    ],
+)
+def test_a_value_of_the_truth_that_cannot_be_is_told_by_its_place(scored, tmp_path, suffix, column, value, words):
+    from pyarrow.csv import write_csv
+
+    east, north = line(T)
+    table = truth(("a", T, east, north))
+    cells = list(table[column])
+    cells[3] = value
+    table[column] = [str(v) for v in cells] if isinstance(value, str) else cells
+    scored(tracks((1, T, east, north)), truth(("a", T, east, north)))
+    path = tmp_path / f"bad.{suffix}"
+    (write_csv if suffix == "csv" else pq.write_table)(pa.table(table), path)
+    with pytest.raises(DataError) as caught:
+        score_files(tmp_path, path)
+    assert f"{path}: {words}" in str(caught.value)
+
+
+def test_a_truth_of_another_time_or_place_is_refused(scored):
+    east, north = line(T)
+    with pytest.raises(
+        DataError,
+        match=r"truth covers 2023-11-15 22:13:20 to 2023-11-15 22:13:40, "
+        r"tracks cover 2023-11-14 22:13:20 to 2023-11-14 22:13:40 \(UTC\): nothing in common",
+    ):
+        scored(tracks((1, T, east, north)), truth(("a", T + 86400.0, east, north)))
+    swapped = truth(("a", T, east, north))
+    swapped["latitude"], swapped["longitude"] = swapped["longitude"], swapped["latitude"]
+    with pytest.raises(DataError, match=r"truth covers latitude 10.4 .*tracks cover latitude 63.4 .*nothing in common"):
+        scored(tracks((1, T, east, north)), swapped)
+    far = truth(("a", T, east, north + 5e3))
+    assert scored(tracks((1, T, east, north)), far)["completeness"] == 0.0
+
+
+def test_no_track_at_all_is_scored(scored):
+    east, north = line(T)
+    found = scored(tracks((1, T, east, north), status="tentative"), truth(("a", T, east, north)))
+    assert (found["completeness"], found["rmse_m"]) == (0.0, None)

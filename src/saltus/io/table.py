@@ -43,7 +43,7 @@ from saltus.io.observer import FRAME, observer_columns
 from saltus.io.part import Part, revisit, scan_period
 from saltus.records import REASONS, Contents, Kind, Plots, Source, System
 
-__all__ = ["read_csv", "read_parquet"]
+__all__ = ["csv_as_text", "read_csv", "read_parquet"]
 
 _ALIASES = {"lat": "latitude", "lon": "longitude", "onground": "on_ground"}
 _DEGREE = np.pi / 180
@@ -88,11 +88,11 @@ def read_csv(path: Path) -> Part:
     problems: list[str] = []
     _check_separator(path)
     try:
-        table = _csv_as_text(path)
+        table = csv_as_text(path)
         broken = np.zeros(table.num_rows, np.bool_)
     except pa.ArrowInvalid as error:
         blanked, broken = _blank_broken(path, problems, error)
-        table = _csv_as_text(blanked)
+        table = csv_as_text(blanked)
     except (pa.ArrowException, OSError) as error:
         raise DataError(f"{path}: no readable CSV table: {str(error).splitlines()[0]}") from error
     return _read(path, table, broken, problems)
@@ -106,7 +106,8 @@ def _check_separator(path: Path) -> None:
             raise DataError(f"{path}: {name} separate the columns. Separate them by commas, and decimals by points.")
 
 
-def _csv_as_text(source: Path | BytesIO) -> pa.Table:
+def csv_as_text(source: Path | BytesIO) -> pa.Table:
+    """Read every column as text, empty cells null: what a cell may hold is then judged cell by cell."""
     from pyarrow import csv as arrow
 
     content = source.read_bytes() if isinstance(source, Path) else source.getvalue()

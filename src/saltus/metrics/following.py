@@ -13,6 +13,7 @@ Targets and tracks are matched as in CLEAR MOT: a target keeps its track while t
 rest is matched at the least sum of squares; another track than the target's last is an identity switch.
 """
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -115,8 +116,8 @@ def _interpolated(
 ) -> _States:
     """Objects at the epochs between their first and last rows, where the rows around are near enough in time."""
     found = [_States(np.zeros(0, np.intp), np.zeros(0, np.intp), np.zeros((0, 3)), np.zeros((0, 2, 2)))]
-    begin = np.searchsorted(label, np.unique(label))
-    for a, b in zip(begin, [*begin[1:], len(label)], strict=True):
+    ends = np.append(np.searchsorted(label, np.unique(label)), len(label))
+    for a, b in pairwise(ends):
         first, last = np.searchsorted(epochs, time[a]), np.searchsorted(epochs, time[b - 1], side="right")
         epoch = np.arange(first, last)
         after = np.clip(np.searchsorted(time[a:b], epochs[epoch]), 0, b - a - 1) + a
