@@ -144,6 +144,8 @@ def test_what_the_data_do_not_bound_is_left_open(rng):
         (np.arange(10.0), np.arange(10.0), "9 intervals are too few"),
         (np.repeat(np.arange(30.0), 2), np.arange(60.0), "share a time"),
         (np.zeros(0), np.zeros(0), "no value"),
+        (np.arange(40.0), np.full(40, 0.1), r"all 40 values are constant \(0\.1\)"),
+        (np.arange(40.0), np.zeros(40), r"constant \(0\)"),
     ],
 )
 def test_bad_data_are_refused(times, values, message):
@@ -223,4 +225,15 @@ def test_a_wrong_command_gives_one_clear_line(tmp_path, words, message):
     write_csv(tmp_path / "r.csv", {"time": [0.0, 1.0], "east": [1.0, 2.0], "name": ["a", "b"]})
     done = command(tmp_path / "r.csv", *words, "-o", tmp_path / "out")
     assert done.exit_code == 2 and message in done.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_is_no_reference_for_itself(tmp_path):
+    path = tmp_path / "seen.csv"
+    time = np.arange(60.0)
+    write_csv(
+        path, {"time": time, "latitude": 50.0 + 1e-4 * time, "longitude": np.full(60, 8.0), "icao24": ["3c0001"] * 60}
+    )
+    done = command(path, "--reference", path, "-o", tmp_path / "out")
+    assert done.exit_code == 2 and "all 60 residuals are 0" in done.output and "the same recording?" in done.output
     assert not (tmp_path / "out").exists()

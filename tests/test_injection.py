@@ -84,6 +84,14 @@ def test_downlinked_data_are_found_by_time_range_and_azimuth(rng, tmp_path):
         downlinked(plots, path)
 
 
+def test_what_is_no_table_is_no_reference(rng, tmp_path):
+    with pytest.raises(DataError, match=r"absent\.parquet: no such file"):
+        downlinked(radar_plots(rng, 3), tmp_path / "absent.parquet")
+    (tmp_path / "good.csv").write_text("time,latitude,longitude\n")
+    with pytest.raises(DataError, match=r"good\.csv: no Parquet table\. A reference is .*bds50_track_deg"):
+        downlinked(radar_plots(rng, 3), tmp_path / "good.csv")
+
+
 def test_simulated_aircraft_are_interpolated():
     truth = pa.table(
         {

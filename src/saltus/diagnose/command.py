@@ -62,7 +62,10 @@ def diagnose_noise(
     fits = {}
     for i, name in enumerate(found.names):
         there = np.isfinite(found.values[:, i])
-        fits[name] = fit_noise(found.times[there], found.values[there, i], found.labels[there], motion=motion)
+        try:
+            fits[name] = fit_noise(found.times[there], found.values[there, i], found.labels[there], motion=motion)
+        except DataError as error:
+            raise DataError(f"{', '.join(map(str, inputs))}: {name}: {error}") from error
     with output_directory(output) as folder:
         text = json.dumps({name: _tree(fit) for name, fit in fits.items()}, indent=2, allow_nan=False)
         (folder / "noise.json").write_text(text + "\n", encoding="utf-8")

@@ -19,6 +19,7 @@ _WORTH = 3.84  # likewise for one parameter, 5 %
 _UNEXPLAINED = 0.25  # correlation of successive innovations that a right model does not leave
 _LOST = 1e-3  # share of a parameter along directions without information that leaves it open
 _FINE = 0.02  # last step of the search, in logarithms
+_CONSTANT = 1e-12  # relative: values that differ by less are one value
 _HIDDEN = 9.0  # logit of the coloured share at which the white part counts as absent
 
 
@@ -95,7 +96,8 @@ def fit_noise(
         outlier: residuals further from the median than this many robust standard deviations are left out.
 
     Raises:
-        DataError: shapes differ, values are not finite, two values of a series share a time, or there are too few.
+        DataError: shapes differ, values are not finite or all alike, two values of a series share a
+            time, or there are too few.
 
     Source: exact Gaussian likelihood by prediction errors, Schweppe (1965); intervals from the observed information.
     """
@@ -107,6 +109,8 @@ def fit_noise(
         raise DataError("there is no value to fit noise to.")
     if not (np.isfinite(t).all() and np.isfinite(r).all()):
         raise DataError("times and values must be finite: drop rows without a residual first.")
+    if np.ptp(r) <= _CONSTANT * np.abs(r).max():
+        raise DataError(f"all {len(r)} values are constant ({r[0]:.6g}): there is no noise to fit.")
     kept = np.ones(len(t), bool) if motion else _inliers(r, outlier)
     data = pack(t[kept], r[kept], label[kept])
     steps = np.diff(data.t, axis=1)

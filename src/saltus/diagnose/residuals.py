@@ -20,6 +20,7 @@ __all__ = ["Phase", "Residuals", "from_recordings", "from_table"]
 Phase = Literal["all", "air", "ground"]
 _Array = npt.NDArray[np.float64]
 
+_SAME = 1e-6  # m: residuals below this are rounding
 _BRACKET = 3.0  # s: reference reports further apart are not interpolated between
 _HEIGHT = (5000.0, 3500.0)  # m: of targets that do not tell it
 
@@ -77,7 +78,7 @@ def from_recordings(
     interpolated between. `phase` keeps the reports said to be in the air, or on the ground.
 
     Raises:
-        DataError: a file cannot be read, a site is not configured, or no address occurs in both.
+        DataError: a file cannot be read, a site is not configured, no address occurs in both, or both say the same.
     """
     seen, truth = (
         io.read(list(paths), date=config.date, editions=config.editions).plots for paths in (inputs, reference)
@@ -100,6 +101,11 @@ def from_recordings(
         labels.append(np.full(int(good.sum()), address, np.int64))
     if not times or not sum(map(len, times)):
         raise DataError("no Mode S address is in both the recording and the reference at the same time.")
+    if np.nanmax(np.abs(np.concatenate(values))) < _SAME:
+        raise DataError(
+            f"all {sum(map(len, times))} residuals are 0: is {', '.join(map(str, reference))} the same recording? "
+            "A reference is another, better one of the same aircraft."
+        )
     found = Residuals(
         ("east", "north"),
         np.concatenate(times),

@@ -72,9 +72,17 @@ def downlinked(plots: Plots, path: Path) -> Reference:
         path: Parquet with time (s, UTC), rho_nm, theta_deg, bds50_track_deg, bds50_roll_deg, bds50_gs_kt.
 
     Raises:
-        DataError: a column is missing, or the table knows other plots.
+        DataError: no Parquet table, a column is missing, or the table knows other plots.
     """
-    table = pq.read_table(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such file.")
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise DataError(
+            f"{path}: no Parquet table. A reference is one of the same plots with what aircraft downlinked (BDS 5,0), "
+            f"in columns {', '.join(_COLUMNS)}."
+        ) from error
     missing = [name for name in _COLUMNS if name not in table.schema.names]
     if missing:
         raise DataError(f"{path}: no column {', '.join(missing)}; a reference has {', '.join(_COLUMNS)}.")
