@@ -172,6 +172,8 @@ def test_a_table_of_residuals(tmp_path, rng):
     done = command(tmp_path / "r.csv", "--columns", "east,north", "--series", "flight", "-o", tmp_path / "out")
     assert done.exit_code == 0, done.output
     assert "suggested noise: first_order(tau=" in done.output and "suggested noise: R = " in done.output
+    assert "(tau: s; sigma: a standard deviation in the column's unit" in done.output
+    assert "(R: a variance in the square of the column's unit)" in done.output
     found = json.loads((tmp_path / "out" / "noise.json").read_text())
     assert list(found) == ["east", "north"]
     assert found["east"]["verdict"] == "coloured" and found["north"]["verdict"] == "white"
@@ -204,6 +206,7 @@ def test_two_recordings_of_the_same_aircraft(tmp_path, rng):
     write_csv(tmp_path / "seen.csv", seen)
     done = command(tmp_path / "seen.csv", "--reference", tmp_path / "truth.csv", "-o", tmp_path / "out")
     assert done.exit_code == 0, done.output
+    assert "(tau: s; sigma: a standard deviation in m" in done.output
     found = json.loads((tmp_path / "out" / "noise.json").read_text())
     assert found["north"]["verdict"] == "coloured"
     assert found["north"]["tau"]["low"] < 10.0 < found["north"]["tau"]["high"]

@@ -103,7 +103,19 @@ def _show(found: Residuals, fits: dict[str, NoiseFit], output: Path) -> None:
         if np.isfinite(fit.overconfidence):
             click.echo(f"  the mean of 10 errors varies {fit.overconfidence:.1f} times as much as white noise promises")
         click.echo(f"  suggested noise: {fit.suggestion()}")
+        if fit.verdict != "unexplained":
+            click.echo(f"  {_meaning(fit, found.unit)}")
     click.echo(f"written to {output}/")
+
+
+def _meaning(fit: NoiseFit, unit: str) -> str:
+    """What the arguments of the suggestion are: sigma and white are not of one kind."""
+    variance = f"a variance in {unit}^2" if unit else "a variance in the square of the column's unit"
+    if fit.verdict == "white":
+        return f"(R: {variance})"
+    deviation = f"a standard deviation in {unit}" if unit else "a standard deviation in the column's unit"
+    white = f"; white: {variance}" if fit.white.value > 0 else ""
+    return f"(tau: s; sigma: {deviation}{white})"
 
 
 def _said(p: Parameter) -> str:
