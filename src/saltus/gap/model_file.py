@@ -34,6 +34,7 @@ position = [0, 2]
 """
 
 import difflib
+import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -58,6 +59,7 @@ from saltus.models import (
     constant_velocity,
     singer,
 )
+from saltus.models.checks import FloatArray, numbers
 
 __all__ = ["Scenario", "load_scenario"]
 
@@ -78,6 +80,12 @@ _SENSORS: dict[str, tuple[Callable[..., Any], tuple[str, ...], tuple[str, ...]]]
         ("sigma_range", "sigma_azimuth", "sigma_elevation", "sigma_range_rate", "dims", "axes", "velocities", "offset"),
     ),
 }
+_SECTIONS = {
+    "dynamics": '[dynamics] with kind = "constant_velocity", dims = 2 and accel = 1.0, or another kind',
+    "sensor": '[sensor.NAME] with kind = "position", dims = 2 and sigma = 30.0, or another kind',
+    "prior": "[prior] with mean = [...] and sd = [...], one number per state, or cov = [[...], ...]",
+}
+_OF_CHAINS = "trans|stay|sojourn|rates|per|initial"
 _ORDERS = {"constant_velocity": ("position", "velocity")}
 _THREE = ("position", "velocity", "acceleration")
 
@@ -132,7 +140,10 @@ def load_scenario(path: Path | str) -> Scenario:
 
 def _scenario(content: dict[str, Any]) -> Scenario:
     known = ("title", "interval", "steps", "chain", "dynamics", "sensor", "prior", "judge")
-    table = _table(content, "the file", ("dynamics", "sensor", "prior"), known)
+    table = _table(content, "the file", (), known)
+    for section, example in _SECTIONS.items():
+        if section not in table:
+            raise ModelError(f"the table [{section}] is missing: write {example}.")
     chains = [_chain(c, f"[[chain]] number {i + 1}") for i, c in enumerate(_list(table.get("chain", []), "chain"))]
     sensors = {name: _sensor(s, f"[sensor.{name}]") for name, s in _table(table["sensor"], "[sensor]").items()}
     dynamics = dict(_table(table["dynamics"], "[dynamics]"))
@@ -157,7 +168,16 @@ def _chain(value: object, where: str) -> Chain:
     states = table.pop("states")
     if isinstance(states, Mapping):
         states = {label: Condition(**v) if isinstance(v, Mapping) else v for label, v in states.items()}
-    return Chain(table.pop("name"), states, **table)
+    try:
+        return Chain(table.pop("name"), states, **table)
+    except (SaltusError, TypeError, ValueError) as error:
+        raise ModelError(f"{where}: {_as_toml(str(error))}") from error
+
+
+def _as_toml(said: str) -> str:
+    """Turn a chain's arguments, as Python writes them, into keys of its table."""
+    keys = re.sub(rf"\b({_OF_CHAINS})=(?=[\s,.;)]|$)", r"'\1'", said)
+    return re.sub(rf"\b({_OF_CHAINS})=", r"\1 = ", keys).replace("{label: ", "{label = ")
 
 
 def _sensor(value: object, where: str) -> Any:
@@ -178,15 +198,24 @@ def _made(
         name: tuple(value) if name in ("axes", "velocities") else value
         for name, value in _table(table, where, needed, (*needed, *further)).items()
     }
-    return build(**values)
+    try:
+        return build(**values)
+    except (SaltusError, TypeError, ValueError) as error:
+        raise ModelError(f"{where}: {error}") from error
 
 
 def _prior(value: object) -> Gaussian:
     table = _table(value, "[prior]", ("mean",), ("mean", "sd", "cov"))
     if ("sd" in table) == ("cov" in table):
         raise ModelError("[prior]: give either sd = [...], one per state, or cov = [[...], ...].")
-    cov = np.diag(np.square(np.asarray(table["sd"], np.float64))) if "sd" in table else table["cov"]
-    return Gaussian(table["mean"], cov)
+    return Gaussian(table["mean"], np.diag(np.square(_deviations(table["sd"]))) if "sd" in table else table["cov"])
+
+
+def _deviations(value: object) -> FloatArray:
+    sd = numbers(value, "[prior]: sd")
+    if sd.ndim != 1 or sd.min(initial=0.0) < 0:
+        raise ModelError(f"[prior]: sd = {value!r}: give standard deviations, one per state, none negative.")
+    return sd
 
 
 def _table(
@@ -194,15 +223,15 @@ def _table(
 ) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise ModelError(f"{where} must be a table of keys, got {value!r}.")
-    for key in needed:
-        if key not in value:
-            raise ModelError(f"{where}: the key {key!r} is missing.")
     names = None if known is None else list(known)
     for key in value:
         if names is not None and key not in names:
             near = difflib.get_close_matches(key, names, n=1)
             hint = f"Did you mean {near[0]}?" if near else f"Known are: {', '.join(names)}."
             raise ModelError(f"{where}: unknown key {key!r}. {hint}")
+    for key in needed:
+        if key not in value:
+            raise ModelError(f"{where}: the key {key!r} is missing.")
     return value
 
 

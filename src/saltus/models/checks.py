@@ -24,8 +24,10 @@ def numbers(value: object, what: str) -> FloatArray:
     """
     try:
         array = np.array(value)
-    except ValueError as error:
-        raise ModelError(f"{what} is not an array: its rows differ in length ({error}).") from None
+    except ValueError:
+        rows = [len(r) for r in value if isinstance(r, list | tuple)] if isinstance(value, list | tuple) else []
+        told = f": {', '.join(map(str, rows))}" if len(set(rows)) > 1 else ""
+        raise ModelError(f"{what} is not an array: its rows differ in length{told}.") from None
     if array.dtype.kind not in "biuf":
         raise ModelError(f"{what} must be real numbers, got {value!r}.")
     array = array.astype(np.float64)
