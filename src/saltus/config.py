@@ -9,7 +9,7 @@ latitude = 41.30069956            # degrees, WGS-84
 longitude = 2.10205819
 height = 27.3                     # m above mean sea level; absent = unknown
 category = 48                     # optional: sources of this category only
-name = "BCN"                      # optional; alone, without sac and sic, it names the source of a table
+name = "BCN"                      # optional, each its own; alone, without sac and sic, it names the source of a table
 sigma_range = 30.0                # optional noise: m,
 sigma_azimuth = 0.08              # degrees,
 sigma_xy = 10.0                   # m (plane and geodetic positions),
@@ -31,13 +31,14 @@ import dataclasses
 import datetime
 import difflib
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from saltus.errors import ModelError
+from saltus.io.layout import categories
 from saltus.records import System
 from saltus.tracks.registration import RegistrationSettings
 from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
@@ -174,7 +175,10 @@ def _date(path: Path | str, value: object) -> datetime.date:
     if isinstance(value, datetime.date) and not isinstance(value, datetime.datetime):
         return _of_our_time(value)
     if isinstance(value, str):
-        return parse_date(value)
+        try:
+            return parse_date(value)
+        except ModelError as error:
+            raise ModelError(f"{path}: {error}") from error
     raise ModelError(f"{path}: date = {value}: write {_HINTS['date']}.")
 
 
@@ -189,16 +193,24 @@ def _sensors(path: Path | str, tables: object) -> tuple[SensorConfig, ...]:
             sensors.append(SensorConfig.model_validate(table))
         except ValidationError as error:
             raise ModelError(f"{path}: {where}: {_first(error)}") from error
-    seen: dict[tuple[object, ...], int] = {}
-    for k, s in enumerate(sensors):
-        key = (s.category, s.sac, s.sic) if s.sac is not None else (s.name,)
-        if key in seen:
-            raise ModelError(
-                f"{path}: [[sensor]] number {seen[key] + 1} and number {k + 1} are the same system "
-                f"(category, sac, sic = {key}); keep one, or tell them apart by category."
-            )
-        seen[key] = k
+    _told_apart(path, sensors)
     return tuple(sensors)
+
+
+def _told_apart(path: Path | str, sensors: Sequence[SensorConfig]) -> None:
+    """Refuse two sensors of one system, and two of one name: a table's source would be either."""
+    seen: dict[str, int] = {}
+    for k, s in enumerate(sensors):
+        category = "" if s.category is None else f", category = {s.category}"
+        for key in ([] if s.sac is None else [f"sac = {s.sac}, sic = {s.sic}{category}"]) + [f'name = "{s.name}"']:
+            if key in seen:
+                cure = "give each its own name" if key.startswith("name") else "tell them apart by category"
+                raise ModelError(
+                    f"{path}: [[sensor]] number {seen[key] + 1} and number {k + 1} are the same system ({key}); "
+                    f"keep one, or {cure}."
+                )
+            if key != 'name = ""':
+                seen[key] = k
 
 
 def _first(error: ValidationError) -> str:
@@ -220,6 +232,9 @@ def _editions(path: Path | str, table: object) -> dict[int, str]:
     for key, value in table.items():
         if not str(key).isdigit() or not 1 <= int(key) <= 255 or not isinstance(value, str):
             raise ModelError(f"{path}: [editions] {key} = {value!r}: write {_HINTS['editions']}.")
+        known = categories().get(int(key), {value: None})
+        if value not in known:
+            raise ModelError(f"{path}: [editions] {key} = {value!r}: not known; choose one of {', '.join(known)}.")
         editions[int(key)] = value
     return editions
 
