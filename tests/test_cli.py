@@ -38,14 +38,14 @@ def refused(*arguments, status=2):
 def recording(tmp_path):
     """Ten scans of one target, 50 km away; returns the file and a configuration with its site."""
     path, config = tmp_path / "radar.ast", tmp_path / "sensors.toml"
-    time = 36000.0 + 4.0 * np.arange(10)
+    time, rng = 36000.0 + 4.0 * np.arange(10), np.random.default_rng(3)
     write_cat048(
         path,
         sac=25,
         sic=1,
         time_of_day=time,
-        range_m=50e3 + 200.0 * (time - time[0]),
-        azimuth_rad=np.full(10, 1.0),
+        range_m=50e3 + 200.0 * (time - time[0]) + rng.normal(0.0, 50.0, 10),
+        azimuth_rad=1.0 + rng.normal(0.0, 1e-3, 10),
         altitude_m=np.full(10, 9144.0),
         north_marker_times=time - 0.6,
     )
