@@ -337,6 +337,15 @@ def test_a_time_window_counts_and_draws_only_what_is_inside(tmp_path, monkeypatc
     assert "<dt>On a track</dt><dd>42 <small>95.5%" in page.text
 
 
+def test_tracks_that_coast_past_the_end_do_not_stretch_the_page(tmp_path):
+    parts = scene()
+    past = parts["tracks"].slice(79)
+    past = past.set_column(past.column_names.index("time"), "time", pa.array([T0 + 180.0]))
+    page = render(tmp_path, **(parts | {"tracks": pa.concat_tables([parts["tracks"], past])}))
+    assert page.data["t1"] == T0 + 157.0
+    assert len(column(page.data["updates"]["t"])) == 80
+
+
 def test_failed_writing_leaves_the_old_page(tmp_path, monkeypatch):
     path = tmp_path / "report.html"
     path.write_text("old")

@@ -67,16 +67,14 @@ def within(plots: Plots) -> npt.NDArray[np.bool_]:
 
 
 def rows_within(tracks: "pa.Table", plots: Plots) -> "pa.Table":
-    """Return the rows of tracks up to the last report in the time window of the run; all where it had none.
+    """Return the rows of tracks up to the last usable report; all where there is none.
 
-    A track that lost its object coasts on for a while past the end.
+    Tracks may coast for a while past the end of the recording or of the time window: nothing is known of it.
     """
     import pyarrow.compute as pc
 
-    inside = within(plots) & np.isfinite(plots.time)
-    if within(plots).all() or not inside.any():
-        return tracks
-    return tracks.filter(pc.less_equal(tracks["time"], float(plots.time[inside].max())))
+    usable = plots.time[(plots.reason == 0) & np.isfinite(plots.time)]
+    return tracks.filter(pc.less_equal(tracks["time"], float(usable.max()))) if len(usable) else tracks
 
 
 def time_span(plots: Plots, updates: Updates) -> tuple[float, float] | None:
