@@ -9,7 +9,8 @@ Helgesen et al. (2022), Ocean Engineering, https://github.com/Autoferry/sensor_f
 
 import argparse
 import json
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +28,36 @@ Array = npt.NDArray[np.float64]
 
 
 def main(detections: Path, truth: Path, output: Path, only: Sequence[str]) -> None:
-    """Write both tables."""
+    """Write both tables, or end with one line that says which file is not as it should be."""
+    unknown = sorted(set(only) - set(SENSORS.values()))
+    if unknown:
+        sys.exit(f"--only {','.join(only)}: no sensor {unknown[0]!r}; there are {', '.join(SENSORS.values())}.")
+    table = made(
+        detections, "detections", "scans {sensorID, time, ownshipPosition, measurement}", measurement_table, only
+    )
+    true = made(truth, "truth", "lists of targets {targetID, time, position}", truth_table)
     output.mkdir(parents=True, exist_ok=True)
-    table = measurement_table(json.loads(detections.read_text(encoding="utf-8")), only)
     pq.write_table(table, output / "measurements.parquet")
-    pq.write_table(truth_table(json.loads(truth.read_text(encoding="utf-8"))), output / "truth.parquet")
+    pq.write_table(true, output / "truth.parquet")
     counts = {name: table["source"].to_pylist().count(name) for name in only}
     print(f"{output}/measurements.parquet: " + ", ".join(f"{n} of {name}" for name, n in counts.items()))
+
+
+def made(path: Path, what: str, entries: str, table: Callable[..., pa.Table], *more: Sequence[str]) -> pa.Table:
+    """Make a table of a JSON file."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        sys.exit(f"{path}: {error.strerror}.")
+    except ValueError as error:
+        sys.exit(f"{path}: no JSON, or a part of it: {error}.")
+    wanted = f"{what}: a list of {entries} is wanted"
+    if not isinstance(content, list) or not content:
+        sys.exit(f"{path}: {wanted}, and this is {'empty' if not content else 'none'}.")
+    try:
+        return table(content, *more)
+    except (KeyError, TypeError, ValueError) as error:
+        sys.exit(f"{path}: {wanted}, and an entry of this is another ({type(error).__name__}: {error}).")
 
 
 def measurement_table(detections: Sequence[dict], only: Sequence[str] = tuple(SENSORS.values())) -> pa.Table:

@@ -31,6 +31,9 @@ Array = npt.NDArray[np.float64]
 
 def main(output: Path, picture: Path) -> None:
     """Draw one picture of two panels."""
+    missing = [n for n in ("sensors.toml", "tracks.parquet", "radar_*.ast") if not list(output.glob(n))]
+    if missing:
+        sys.exit(f"{output}: no {missing[0]} in it; name a folder that saltus demo wrote (saltus demo -o FOLDER).")
     config = load_config(output / "sensors.toml")
     sites = [
         Site(np.radians(s.latitude), np.radians(s.longitude), 0.0 if s.height is None else s.height)
@@ -122,4 +125,6 @@ def draw_scale(figure: Figure) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit("usage: python examples/plots_and_tracks.py OUTPUT PICTURE.png")
     main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -44,8 +44,8 @@ def recording(tmp_path):
         sac=25,
         sic=1,
         time_of_day=time,
-        range_m=50e3 + 200.0 * (time - time[0]) + rng.normal(0.0, 50.0, 10),
-        azimuth_rad=1.0 + rng.normal(0.0, 1e-3, 10),
+        range_m=50e3 + 200.0 * (time - time[0]) + rng.normal(0.0, 35.0, 10),
+        azimuth_rad=1.0 + rng.normal(0.0, 8e-4, 10),
         altitude_m=np.full(10, 9144.0),
         north_marker_times=time - 0.6,
     )

@@ -24,12 +24,16 @@ PIREN = pyproj.Transformer.from_pipeline(
 START = 1.62e9
 
 
-@pytest.fixture(scope="module")
-def autoferry():
-    spec = importlib.util.spec_from_file_location("autoferry_to_table", EXAMPLES / "autoferry_to_table.py")
+def loaded(name):
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def autoferry():
+    return loaded("autoferry_to_table")
 
 
 def scan(sensor, time, measurement, ship=(0.0, 0.0)):
@@ -157,6 +161,45 @@ def test_a_recorded_scenario(autoferry, tmp_path, recordings):
     assert found["completeness"] > 0.85
     assert found["rmse_m"] < 7.0
     assert found["id_switches"] == 0
+
+
+DETECTIONS = json.dumps([scan(2, 0, [10, 20])])
+TRUTH = json.dumps([[{"targetID": 1, "position": [0, 0, 0], "time": START}]])
+
+
+@pytest.mark.parametrize(
+    ("detections", "truth", "words"),
+    [
+        (DETECTIONS[:-9], TRUTH, r"d\.json: no JSON, or a part of it"),
+        ("", TRUTH, r"d\.json: no JSON"),
+        ("{}", TRUTH, r"d\.json: detections: a list of scans .* this is empty"),
+        (None, TRUTH, r"d\.json: No such file"),
+        (TRUTH, TRUTH, r"d\.json: detections: a list of scans .*an entry of this is another"),
+        (DETECTIONS, DETECTIONS, r"t\.json: truth: a list of lists of targets .*an entry of this is another"),
+        (DETECTIONS, "[[]]", r"t\.json: truth"),
+        (json.dumps([scan(2, 0, [1, 2, 3])]), TRUTH, r"d\.json: detections"),
+        (json.dumps([scan(7, 0, [1, 2])]), TRUTH, r"d\.json: detections: .*KeyError: 7"),
+    ],
+)
+def test_files_of_another_kind_end_in_one_line(autoferry, tmp_path, detections, truth, words):
+    for name, text in (("d", detections), ("t", truth)):
+        if text is not None:
+            (tmp_path / f"{name}.json").write_text(text)
+    with pytest.raises(SystemExit, match=words) as caught:
+        autoferry.main(tmp_path / "d.json", tmp_path / "t.json", tmp_path / "out", ("radar",))
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_sensor_that_is_not_there(autoferry, tmp_path):
+    with pytest.raises(SystemExit, match="no sensor 'sonar'; there are lidar, radar, ir, eo"):
+        autoferry.main(tmp_path / "d.json", tmp_path / "t.json", tmp_path / "out", ("sonar",))
+
+
+def test_the_picture_needs_a_demonstration(tmp_path):
+    (tmp_path / "tracks.parquet").write_bytes(b"")
+    with pytest.raises(SystemExit, match=r"no sensors\.toml in it; name a folder that saltus demo wrote"):
+        loaded("plots_and_tracks").main(tmp_path, tmp_path / "p.png")
 
 
 def test_the_configuration_is_read():
