@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from saltus.cli import main
 from saltus.errors import DataError
 from saltus.injection import command
-from saltus.injection.figures import RUNS, errors, found
+from saltus.injection.figures import RUNS, errors, found, growth
 from saltus.injection.plots import AZIMUTH, RANGE, inject
 from saltus.injection.reference import Followed, Reference, downlinked, from_run, simulated
 from saltus.records import Kind, Plots, Source, System
@@ -185,6 +185,24 @@ def test_the_study_of_the_simulated_scene(tmp_path, monkeypatch):
     assert set(metrics["growth"]) == {"with", "without"}
     assert set(metrics["figures"]) == set(RUNS)
     assert "injected_told" in result.output
+    assert "told, suspected: p_fault above 0.5" in result.output
+    assert "for growth" not in result.output
+
+
+def test_departures_from_the_programs_own_run_do_not_grow():
+    before, after = {"speed_straight_rms_kt": 0.02, "tracks": 3.0}, {"speed_straight_rms_kt": 1.2, "tracks": 3.0}
+    assert growth(before, after, own=True) == {"speed_straight_rms_kt": None}
+    assert growth(before, after, own=False)["speed_straight_rms_kt"] == pytest.approx(59.0)
+    clean, told = {"plots_straight": 5.0, "plots_turn": 0.0}, {"injected_told": {"value": None, "plots": 0.0}}
+    text = "\n".join(command._explained(True, clean, told))
+    for words in (
+        "– for turn: there is no such plot",
+        "– of 0 plots",
+        "– for growth: the reference is the run over clean",
+    ):
+        assert words in text
+    clean["plots_turn"], told["injected_told"]["value"] = 1.0, 0.9
+    assert len(command._explained(False, clean, told)) == 1
 
 
 def test_options_that_mean_nothing_are_refused(tmp_path):

@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from saltus.demo import write_demo
 from saltus.errors import ModelError
 from saltus.injection.figures import RUNS, draw, errors, found, growth
 from saltus.injection.plots import inject
-from saltus.injection.reference import Followed, Reference, downlinked, followed, from_run, simulated
+from saltus.injection.reference import OWN_RUN, Followed, Reference, downlinked, followed, from_run, simulated
 from saltus.io.write import output_directory
 from saltus.progress import progress_bar
 from saltus.records import Kind, Recording
@@ -125,7 +125,8 @@ def _metrics(
         "injected": {"share": _SHARE, "azimuth": int((fault == 1).sum()), "range": int((fault == 2).sum())},
         "figures": figures,
         "growth": {
-            chains: growth(figures[f"clean_{chains}"], figures[f"injected_{chains}"]) for chains in ("with", "without")
+            chains: growth(figures[f"clean_{chains}"], figures[f"injected_{chains}"], own=truth.name == OWN_RUN)
+            for chains in ("with", "without")
         },
         "p_fault": found(fault, runs["clean_with"], runs["injected_with"], plots),
         "wanted": _WANTED,
@@ -153,3 +154,25 @@ def _show(metrics: dict[str, object]) -> None:
             continue
         value = "–" if row["value"] is None else f"{row['value']:.2%}"
         click.echo(f"{name:32}{value:>9} of {row['plots']:.0f} plots")
+    for line in _explained(metrics["reference"] == OWN_RUN, figures["clean_with"], p):
+        click.echo(line)
+
+
+def _explained(own: bool, clean: Mapping[str, float | None], p: Mapping[str, object]) -> list[str]:
+    """What the labels mean, and why a dash stands where it does."""
+    lines = [
+        "straight, turn: by the reference, on tracks of 5 plots and more and faster than 100 kt; confirmed: of "
+        "confirmed tracks; told, suspected: p_fault above 0.5; left_out: on no track; "
+        "airborne: not said to be on the ground."
+    ]
+    absent = [what for what in ("straight", "turn") if not clean[f"plots_{what}"]]
+    if absent:
+        lines.append(f"– for {' and '.join(absent)}: there is no such plot whose course and speed the reference knows.")
+    if any(isinstance(row, dict) and row["value"] is None for row in p.values()):
+        lines.append("– of 0 plots: there is no such plot that updated a track past its start.")
+    if own:
+        lines.append(
+            "– for growth: the reference is the run over clean plots itself, whose errors are none by definition; "
+            "the errors are departures from it. --reference names a truth."
+        )
+    return lines

@@ -51,13 +51,13 @@ def errors(run: Followed, reference: Reference) -> tuple[_Figures, dict[str, _Ar
     }, parts
 
 
-def growth(before: _Figures, after: _Figures) -> _Figures:
-    """By what share each error grew."""
+def growth(before: _Figures, after: _Figures, *, own: bool) -> _Figures:
+    """By what share each error grew; None of departures from the program's `own` run over clean plots."""
     out: _Figures = {}
     for name, value in before.items():
         later = after[name]
         if name.endswith(("_kt", "_deg")):
-            out[name] = None if not value or later is None else later / value - 1.0
+            out[name] = None if own or not value or later is None else later / value - 1.0
     return out
 
 

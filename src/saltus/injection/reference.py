@@ -11,12 +11,13 @@ import pyarrow.parquet as pq
 from saltus.errors import DataError
 from saltus.records import Plots
 
-__all__ = ["Followed", "Reference", "downlinked", "followed", "from_run", "simulated"]
+__all__ = ["OWN_RUN", "Followed", "Reference", "downlinked", "followed", "from_run", "simulated"]
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
 
 KNOT = 1852.0 / 3600.0
+OWN_RUN = "the run over clean plots, faults known"  # name of a reference that is no truth
 _STEPS = (1 / 128, 1852 / 256, 2 * np.pi / 65536)  # s, m, rad: quantisation of CAT048
 _STRAIGHT, _TURN = 3.0, 10.0  # degrees of roll
 _COLUMNS = ("time", "rho_nm", "theta_deg", "bds50_track_deg", "bds50_roll_deg", "bds50_gs_kt")
@@ -134,7 +135,7 @@ def from_run(run: Followed) -> Reference:
     """Take a run over clean plots for the truth: straight is where it thinks so."""
     known = np.isfinite(run.course)
     return Reference(
-        "the run over clean plots, faults known",
+        OWN_RUN,
         run.course,
         run.speed,
         known & (run.p_manoeuvre < 0.5),
