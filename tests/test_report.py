@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from saltus.errors import DataError
 from saltus.geo import Site
 from saltus.records import REASONS, Kind, Plots, Source, System
 from saltus.report import colours, data, tables, write_report
@@ -354,7 +355,7 @@ def test_failed_writing_leaves_the_old_page(tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(OSError, match="disk full"):
+    with pytest.raises(DataError, match="disk full"):
         write_report(path, **scene(), summary={}, sites={})
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

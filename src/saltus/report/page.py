@@ -66,8 +66,7 @@ def write_report(
         names: what people read for a system's designation, its name as configured; None: the designation.
 
     Raises:
-        DataError: `path` is a directory.
-        OSError: the page cannot be written.
+        DataError: the page cannot be written.
     """
     updates = read_updates(rows_within(tracks, plots))
     names = names or {}
