@@ -172,13 +172,13 @@ def _of_our_time(date: datetime.date) -> datetime.date:
 
 
 def _date(path: Path | str, value: object) -> datetime.date:
-    if isinstance(value, datetime.date) and not isinstance(value, datetime.datetime):
-        return _of_our_time(value)
-    if isinstance(value, str):
-        try:
+    try:
+        if isinstance(value, datetime.date) and not isinstance(value, datetime.datetime):
+            return _of_our_time(value)
+        if isinstance(value, str):
             return parse_date(value)
-        except ModelError as error:
-            raise ModelError(f"{path}: {error}") from error
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
     raise ModelError(f"{path}: date = {value}: write {_HINTS['date']}.")
 
 
