@@ -259,6 +259,7 @@ def test_what_cannot_be_scored_is_one_line(tmp_path):
     assert "column 'time' is of type list" in said(tmp_path, tmp_path / "truth.parquet")
     pq.write_table(pa.table(truth(("a", T, east, north))).slice(0, 0), tmp_path / "truth.parquet")
     assert "no row" in said(tmp_path, tmp_path / "truth.parquet")
+    assert "is a folder; name a table" in said(tmp_path, tmp_path)
     assert "absent.parquet: no such file" in said(tmp_path, tmp_path / "absent.parquet")
     (tmp_path / "ragged.csv").write_text("time,target_id,latitude,longitude\n1,a,2,3\n4,a,5\n")
     assert "row 1 has 3 cells where the header has 4" in said(tmp_path, tmp_path / "ragged.csv")
