@@ -204,10 +204,11 @@ def _told_apart(path: Path | str, sensors: Sequence[SensorConfig]) -> None:
         category = "" if s.category is None else f", category = {s.category}"
         for key in ([] if s.sac is None else [f"sac = {s.sac}, sic = {s.sic}{category}"]) + [f'name = "{s.name}"']:
             if key in seen:
-                cure = "give each its own name" if key.startswith("name") else "tell them apart by category"
+                named = key.startswith("name")
+                what = "have one name" if named else "are the same system"
+                cure = "give each its own name" if named else "tell them apart by category"
                 raise ModelError(
-                    f"{path}: [[sensor]] number {seen[key] + 1} and number {k + 1} are the same system ({key}); "
-                    f"keep one, or {cure}."
+                    f"{path}: [[sensor]] number {seen[key] + 1} and number {k + 1} {what} ({key}); keep one, or {cure}."
                 )
             if key != 'name = ""':
                 seen[key] = k
