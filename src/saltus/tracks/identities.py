@@ -31,6 +31,7 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 
 _SCALES = ((1.0, 0.7), (3.0, 0.2), (10.0, 0.07), (30.0, 0.03))  # of the lasting difference, with probabilities
+_SLOW = 10.0  # times the usual size, from which a difference lasts longer in proportion
 _REACH = 4.0  # standard deviations of a residual within which tracks may be one object
 _ROWS = 8.0  # of the slower system that a window holds at least
 _LARGE = 10.0  # of the lasting difference: so far it may reach
@@ -107,7 +108,8 @@ def _mixed(a: LocalTracks, b: LocalTracks, pairing: PairSettings, reach: float, 
     """Evidence with a lasting difference of unknown size: a mixture over multiples of its standard deviation."""
     parts = []
     for scale, share in _SCALES:
-        wide = replace(pairing, offset_cov=scale**2 * np.asarray(pairing.offset_cov))
+        cov, lasts = scale**2 * np.asarray(pairing.offset_cov), max(1.0, scale / _SLOW) * pairing.offset_time
+        wide = replace(pairing, offset_cov=cov, offset_time=lasts)
         parts.append((pair_evidence(a, b, wide, reach=reach, window=window), np.log(share)))
     first = parts[0][0]
     llr = logsumexp(np.stack([e.llr + weight for e, weight in parts], axis=-1), (1,))[:, 0]
