@@ -5,8 +5,12 @@ import pytest
 from saltus.summary import _doubts
 
 
-def row(nis, configured, estimated):
-    return {"nis_mean": nis, "sigma_range_m": {"configured": configured, "estimated": estimated, "used": configured}}
+def row(nis, configured, estimated, updates=500):
+    return {
+        "nis_mean": nis,
+        "nis_updates": updates,
+        "sigma_range_m": {"configured": configured, "estimated": estimated, "used": configured},
+    }
 
 
 @pytest.mark.parametrize(
@@ -15,6 +19,8 @@ def row(nis, configured, estimated):
         (row(2.0, 30.0, 28.0), []),
         (row(None, None, None), []),
         (row(1.0, None, 28.0), []),
+        (row(4.0, 30.0, 28.0, updates=9), []),
+        (row(0.1, 30.0, 28.0, updates=9), []),
         (row(4.0, 30.0, 28.0), ["larger than the noise used"]),
         (row(0.1, 30.0, None), ["far smaller than the noise used"]),
         (row(2.0, 0.05, 4.6), ["configured as 0.05 and its tracks say 4.6"]),

@@ -130,6 +130,7 @@ def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, 
         row["update_period_s"] = _rounded(sensors.periods[s])
         row["nis_mean"] = _rounded(float(d2[at].mean()) if at.any() else np.nan)
         row["nis_expected"] = 2.0
+        row["nis_updates"] = int(at.sum())
         table[name if name not in table else f"{name} ({plots.sources[s].system})"] = row
     return table
 
@@ -187,7 +188,7 @@ def _doubts(noise: dict[str, Any]) -> list[str]:
         "(a bias between sources, or errors that last). Covariances of its tracks are too small; set its sigma or "
         "correlation_time in the configuration."
         for name, row in noise.items()
-        if row["nis_mean"] is not None and row["nis_mean"] > _DOUBTFUL_NIS
+        if row["nis_mean"] is not None and row["nis_mean"] > _DOUBTFUL_NIS and _telling(row)
     ] + [
         f"{name}: {why}; is a unit wrong (NM for m, radians for degrees), or sigma in the configuration?"
         for name, row in noise.items()
@@ -195,11 +196,16 @@ def _doubts(noise: dict[str, Any]) -> list[str]:
     ]
 
 
+def _telling(row: dict[str, Any]) -> bool:
+    """Say whether the mean NIS is further from 2 than four of its standard errors, 2 / sqrt(n)."""
+    return bool(abs(row["nis_mean"] - 2.0) * np.sqrt(row["nis_updates"]) > 4.0 * 2.0)
+
+
 def _implausible(row: dict[str, Any]) -> list[str]:
     """Say what of one source's noise cannot be as it is."""
     why = []
     nis = row["nis_mean"]
-    if nis is not None and nis < _TOO_SMALL_NIS:
+    if nis is not None and nis < _TOO_SMALL_NIS and _telling(row):
         why.append(f"NIS {nis} where 2 is expected: the errors are far smaller than the noise used")
     for label in (label for label in row if label.startswith("sigma")):
         configured, estimated = row[label]["configured"], row[label]["estimated"]
