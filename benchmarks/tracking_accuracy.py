@@ -121,7 +121,8 @@ def downlinked(plots: Plots, reference: Path) -> tuple[Array, Array, Array]:
     at = np.array([row.get(key, -1) for key in keys(plots.time, plots.range, plots.azimuth)])
     if np.mean(at >= 0) < 0.99:
         raise SystemExit(f"{reference}: only {np.mean(at >= 0):.1%} of the recording's reports are in this table.")
-    return tuple(np.where(at >= 0, values[at], np.nan) for values in (course, roll, knots * _KNOT))  # type: ignore
+    course, roll, speed = (np.where(at >= 0, values[at], np.nan) for values in (course, roll, knots * _KNOT))
+    return course, roll, speed
 
 
 def keys(t: Array, slant: Array, azimuth: Array) -> list[tuple[int, ...]]:

@@ -113,7 +113,6 @@ def write_tracks(
         **{name: asdict(getattr(config, name)) for name in ("tracker", "filter", "systems", "registration")},
     }
     summary["seconds"] = {"decoding": round(decoded - began, 2), "tracking": round(done - decoded, 2)}
-    titles = {str(s.system): name for s, name in zip(plots.sources, sensors.names, strict=True)}
     _write(folder, tracks, assigned, whole, summary)
     if report:
         from saltus.report import write_report
@@ -131,7 +130,7 @@ def write_tracks(
             systems=systems_found(whole, config.systems, called),
             names=called,
         )
-    return summary, system_lines(whole, titles)
+    return summary, system_lines(whole, called)
 
 
 def track_recording(
