@@ -263,7 +263,7 @@ def _anew(
     several = in_several(lanes.piece, scene.owner[index])
     cov = m.cov[index] * m.inflation[index, None, None]
     cov[:, :2, :2] += several[:, None, None] * (0.5 * lasting**2 * np.eye(2) + scene.doubt[index])
-    faulty = _faulty(m, index, settings, periods) + (cov - m.cov[index])[:, None]
+    faulty = _faulty(m, index, settings) + (cov - m.cov[index])[:, None]
     lane = np.cumsum(is_first(lanes.piece)) - 1
     updates = LaneRows(lane, m.time[index], m.position[index], cov, faulty)
     every, measured = with_coasted(updates, lanes.track, shortest_periods(lanes, m, periods), settings)
@@ -295,7 +295,7 @@ def _same_plots(wanted: _Index, plots: _Index) -> _Index:
     return np.asarray(order[np.searchsorted(plots[order], wanted)])
 
 
-def _faulty(m: Measurements, index: _Index, settings: TrackerSettings, periods: Sequence[float]) -> _Array:
+def _faulty(m: Measurements, index: _Index, settings: TrackerSettings) -> _Array:
     """Covariances of plots with either fault, (k, 2, 3, 3): of azimuth and range, or of the position, twice."""
     out = np.repeat(m.cov[index][:, None], 2, axis=1)
     polar = np.isfinite(m.ray[index, 0])
