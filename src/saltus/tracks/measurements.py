@@ -33,6 +33,7 @@ _Array = npt.NDArray[np.float64]
 _RANGE, _AZIMUTH, _ELEVATION, _XY, _ALTITUDE = 50.0, np.radians(0.08), np.radians(0.3), 20.0, 10.0
 _SURFACE, _GROUND_RELIEF = 10, 20.0  # ASTERIX category of surface movement; m
 _SMALLEST_AREA = 1e6  # m^2
+_HULL, _RESOLUTION = 75.0, 15.0  # m, and in standard deviations: how far two plots of one target differ
 _SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
 
 
@@ -113,6 +114,9 @@ class Measurements:
     ) -> npt.NDArray[np.bool_]:
         """Say which plots left over are second plots of a target seen in the same scan.
 
+        What a source resolves goes with its errors: two plots of one target that it measures to a metre differ by the
+        target's length at most.
+
         Args:
             left: plots without a track, (k,).
             used: plots of the same source and scan that updated a confirmed track, (l,).
@@ -120,14 +124,22 @@ class Measurements:
             max_azimuth: rad.
         """
         a, b = left[:, None], used[None, :]
+        reach = np.minimum(max_range, _HULL + _RESOLUTION * self._deviation(left)[:, None])
         d_range, d_azimuth = np.moveaxis(np.abs(self.polar[a] - self.polar[b]), -1, 0)
         d_azimuth = np.minimum(d_azimuth, 2.0 * np.pi - d_azimuth)
         distance = np.linalg.norm(self.position[a, :2] - self.position[b, :2], axis=-1)
-        near = np.where(np.isnan(d_range), distance < max_range, (d_range < max_range) & (d_azimuth < max_azimuth))
+        near = np.where(np.isnan(d_range), distance < reach, (d_range < reach) & (d_azimuth < max_azimuth))
         apart = np.abs(self.position[a, 2] - self.position[b, 2]) > _SAME_HEIGHT
         for codes in (self.icao24, self.mode3a):
             apart |= (codes[a] >= 0) & (codes[b] >= 0) & (codes[a] != codes[b])
         return np.asarray((near & ~apart).any(axis=1))
+
+    def _deviation(self, index: npt.NDArray[np.intp]) -> _Array:
+        """Standard deviation along the ray (k,), m; of either axis where there is none."""
+        R = self.cov[index, :2, :2]
+        along = self.ray[index] / np.maximum(np.linalg.norm(self.ray[index], axis=-1, keepdims=True), 1e-9)
+        variance = np.einsum("ni,nij,nj->n", along, R, along)
+        return np.asarray(np.sqrt(np.where(np.isnan(variance), 0.5 * np.trace(R, axis1=-2, axis2=-1), variance)))
 
 
 def make_plane(plots: Plots, sites: Sequence[Site | None]) -> Plane:
