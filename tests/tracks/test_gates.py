@@ -53,7 +53,7 @@ def later(rng, mean, accel, sigma, accel_v=1.0):
 def gated(filters, mean, m, *, probability, identity=True, prior=None, **kwargs):
     kinematics, life, rows = tracks(filters, mean, **kwargs)
     settings = TrackerSettings(gate_probability=probability)
-    gate = Gate(settings, filters, use_identity=identity)
+    gate = Gate(settings, filters, np.array([4.0, 4.0]), use_identity=identity)
     source = SourceCondition(plot_law(settings, polar=bool(np.isfinite(m.ray).all())), settings)
     prior = source.predicted(0.0) if prior is None else np.log(prior)
     found = gate(kinematics, life, m, np.arange(len(m)), source, prior)

@@ -170,6 +170,20 @@ def test_second_plots_of_a_target_are_split_plots(rng):
     assert (found.raw.track_id[second] == 0).all()
 
 
+@pytest.mark.parametrize(("sigma", "tracks"), [(1.0, 2), (40.0, 1)])
+def test_a_fine_radar_tells_apart_what_a_coarse_one_takes_for_one_target(rng, sigma, tracks):
+    """Two aircraft stand 150 m apart on one ray: two targets to a surface radar, a split plot to another."""
+    stands = [Trajectory((x, x, 500.0), 0.0, 0.1, (Leg(200.0),)) for x in (1500.0, 1606.0)]
+    late = Trajectory((1606.0, 1606.0, 500.0), 0.0, 0.1, (Leg(200.0),))
+    m, label = looked_at(rng, [stands[0], late], radar(sigma_range=sigma, sigma_azimuth=1e-4))
+    m = m.take(np.flatnonzero((label == 0) | (m.time > 60.0)))
+    position = m.position.copy()
+    position[:, 2] = np.nan
+    found = run(replace(m, position=position))
+    assert len(found.raw.confirmed) == tracks
+    assert found.raw.split.any() == (tracks == 1)
+
+
 def test_another_height_or_code_is_no_split_plot(rng):
     """A pair 1000 ft apart, one above the other, gives two tracks."""
     pair = [Trajectory((60e3, 20e3, h), 0.3, 230.0, (Leg(200.0),)) for h in (9000.0, 9304.8)]
@@ -244,6 +258,20 @@ def test_a_target_that_reports_seldom_gets_a_track(rng):
     assert len(np.unique(found.track_id[parked])) == 1 and found.track_id[parked][0] > 0
     assert len(np.unique(found.track_id[~parked])) == 1
     assert not run(m, periods=(0.5,)).track_id[parked].any()
+
+
+def test_targets_that_report_in_turn_get_their_own_tracks(rng):
+    """Twenty stand within 500 m and report every half second, when they like: most from their own plots alone."""
+    n, k, right = 40, 20, []
+    for _ in range(4):
+        place, phase = rng.uniform(0.0, 500.0, (k, 2)), rng.uniform(0.0, 0.5, (k, 1))
+        time = (0.5 * np.arange(float(n)) + phase + rng.uniform(-0.05, 0.05, (k, n))).ravel()
+        xy = np.repeat(place, n, axis=0) + rng.standard_normal((n * k, 2))
+        m, label = measured(time, xy, 1.0), np.repeat(np.arange(k), n)[np.argsort(time, kind="stable")]
+        track = run(m, periods=(0.5,), identity=False).track_id
+        for ids in (track[(m.time > 5.0) & (label == j)] for j in range(k)):
+            right.append(np.bincount(ids[ids > 0], minlength=1).max() / len(ids))
+    assert np.mean(right) > 0.95
 
 
 def scene(rng, seconds=160.0):

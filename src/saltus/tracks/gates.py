@@ -20,6 +20,7 @@ _Index = npt.NDArray[np.intp]
 
 _POSITION, _VELOCITY = np.array([0, 2, 4]), np.array([1, 3, 5])
 _FAULT_GATE = 0.99
+_SOONEST = 0.75  # of the update period: no target's second plot comes sooner
 _LATEST = -2.0  # s: how far a plot may lie before its track's last update
 
 
@@ -44,8 +45,11 @@ class Gate:
     inside; which mode explains the plot is for the likelihoods to say.
     """
 
-    def __init__(self, settings: TrackerSettings, filters: FilterSettings, *, use_identity: bool) -> None:
-        """Fix thresholds from the settings."""
+    def __init__(
+        self, settings: TrackerSettings, filters: FilterSettings, periods: _Array, *, use_identity: bool
+    ) -> None:
+        """Fix thresholds from the settings and the update periods of the sources, s."""
+        self._periods = periods
         self.horizontal = _chi2_quantile(settings.gate_probability, 2)
         self.height = _chi2_quantile(settings.gate_probability, 1)
         self.fault = _chi2_quantile(_FAULT_GATE, 2)
@@ -179,10 +183,14 @@ class Gate:
         return np.asarray(np.sqrt(self.fault) * bounds.astray(m, plot))
 
     def _admissible(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index) -> Pairs:
-        """Drop pairs of contradicting addresses, and plots too old for the track."""
-        plot = index[pairs.plot]
+        """Drop pairs of contradicting addresses, plots too old for the track, and those too soon after its first.
+
+        Where targets report at times of their own, a neighbour's plot comes before the next one of a new target.
+        """
+        plot, first = index[pairs.plot], life.plot[pairs.track]
         dt = m.time[plot] - life.time[pairs.track]
-        keep = np.where(life.status[pairs.track] == SEED, dt > 0.0, dt > _LATEST)
+        soonest = np.where(m.source[plot] == m.source[first], _SOONEST * self._periods[m.source[plot]], 0.0)
+        keep = np.where(life.status[pairs.track] == SEED, (dt > 0.0) & (dt >= soonest), dt > _LATEST)
         if self._use_identity:
             keep &= ~conflicting(life.icao24[pairs.track], m.icao24[plot])
             keep &= (life.icao24[pairs.track] >= 0) | ~life.holds(m.icao24[plot])  # an address goes to its own track

@@ -50,6 +50,7 @@ class Lifecycle:
         self.icao24 = np.zeros(0, np.int32)
         self.mode3a = np.zeros(0, np.int16)
         self.plot = np.zeros(0, np.intp)  # last plot, as measurement index
+        self.sound = np.zeros(0, np.intp)  # last one that was not faulty
         self.named = np.zeros(0, np.intp)  # last plot with a callsign, as measurement index, -1 none
 
     def rows(self) -> _Rows:
@@ -64,6 +65,7 @@ class Lifecycle:
         self._next_id += len(rows)
         self.status[rows] = SEED
         self.time[rows], self.period[rows], self.plot[rows] = birth[:3]
+        self.sound[rows] = birth.plot
         self.mean[rows], self.cov[rows] = birth[3:]
         self.located[rows] = birth.time
         self.history[rows] = 1
@@ -101,6 +103,8 @@ class Lifecycle:
         self.located[rows] = np.maximum(self.located[rows], time)
         self.coasted[rows] = 0
         self.plot[rows] = plot
+        right = slice(None) if sound is None else sound
+        self.sound[rows[right]] = plot[right]
 
     def sighted(self, rows: _Rows, time: _Array) -> None:
         """Enter a bearing for each row: it moves the state, and neither confirms the track nor keeps it alive."""

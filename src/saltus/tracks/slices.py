@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from saltus.tracks.measurements import Measurements
 
-__all__ = ["rounds", "slices"]
+__all__ = ["rounds", "shortest", "slices"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -17,6 +17,12 @@ _Index = npt.NDArray[np.intp]
 _ROTATING, _OTHER, _IN_ROUNDS = 0.9, 0.4, 4.0
 _LONGEST = 4.0  # s
 _DEVIATIONS = 4.0  # of two plots of one target
+
+
+def shortest(m: Measurements, source: int) -> float:
+    """Return the share of its period within which a target gives a source at most one plot."""
+    own = np.flatnonzero(m.source == source)
+    return _ROTATING if len(own) and np.isfinite(m.ray[own[0], 0]) else _OTHER
 
 
 def slices(m: Measurements, periods: _Array) -> Iterator[tuple[int, int]]:

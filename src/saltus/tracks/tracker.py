@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
+from saltus.tracks.background import Background, background
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
@@ -23,11 +24,10 @@ __all__ = ["Tracker"]
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
-_UNEXPLAINED = 0.1  # of a source's plots are clutter or new targets
-_HEIGHT_SPAN = 15_000.0  # m: heights of clutter and new targets spread over this
 _CLIMB = 15.0  # m/s: standard deviation of the vertical speed of a new track
+_SURPLUS = 1.5  # periods between two right plots, below which none is missing between them
 _NEGLIGIBLE = 1e-3  # probability of all other hypotheses of a plot that is taken for right
-_STANDING = np.array([-4.0, -2.0, 0.0])  # nats: a plot is less likely a seed's or a tentative track's own
+_STANDING = np.array([-3.0, -2.0, 0.0])  # nats: a plot is less likely a seed's or a tentative track's own
 
 
 class Tracker:
@@ -58,7 +58,7 @@ class Tracker:
         self._use_identity = use_identity
         self._kinematics = make_kinematics(filters)
         self._life = Lifecycle(settings)
-        self._gate = Gate(settings, filters, use_identity=use_identity)
+        self._gate = Gate(settings, filters, self._periods, use_identity=use_identity)
         # The gate of a track of one plot, at rest with this deviation of speed, ends at the fastest target's.
         self._seed_speed = settings.max_speed / np.sqrt(self._gate.horizontal)
         sojourn = np.array(filters.sojourn_h)
@@ -82,7 +82,7 @@ class Tracker:
         self._track_id = np.zeros(len(measurements), np.int64)
         self._split = np.zeros(len(measurements), bool)
         self._elsewhere = np.zeros(len(measurements), bool)
-        self._density = self._densities(measurements)
+        self._background = self._densities(measurements)
         self._sources = [self._condition(s) for s in range(len(self._periods))]
         for begin, end in slices(measurements, self._periods):
             self._housekeep(float(measurements.time[begin]))
@@ -103,11 +103,11 @@ class Tracker:
         law = plot_law(self._settings, polar=bool(own.any() and np.isfinite(self._m.ray[own, 0]).all()))
         return SourceCondition(law, self._settings)
 
-    def _densities(self, m: Measurements) -> _Array:
-        """Clutter and new targets per m^2 and scan, of each source."""
-        if self._settings.clutter_density is not None:
-            return np.full(len(self._periods), self._settings.clutter_density)
-        return _UNEXPLAINED * np.array([m.density(s, float(p)) for s, p in enumerate(self._periods)])
+    def _densities(self, m: Measurements) -> Background:
+        """Clutter and new targets at each measurement."""
+        found = background(m, self._periods)
+        given = self._settings.clutter_density
+        return found if given is None else found._replace(plane=np.full(len(m), given))
 
     def _housekeep(self, now: float) -> None:
         """Publish what coasts; drop what is overdue or moves as no target does."""
@@ -145,6 +145,8 @@ class Tracker:
         life.renew(rows[again])
         self._track_id[life.plot[rows[again]]] = life.id[rows[again]]
         new = again | (life.status[rows] == SEED)
+        right = ~new & (wrong <= 0.5)
+        surplus = self._surplus(rows[right], plots[right])
         self._start(rows[new], plots[new])
         self._update(rows[~new], gated, chosen[~new], weights[~new], p[~new])
         self._enter(rows, plots, wait, gated.height_used[chosen], sound=new | (wrong <= 0.5))
@@ -158,6 +160,7 @@ class Tracker:
         self._begin(index[left], used, wait)
         far = np.linalg.norm(m.position[plots, :2] - gated.centre[chosen], axis=-1) > self._settings.split_range
         self._also_begin(plots[~new & (wrong > 0.5) & far], used, wait)
+        self._seed(self._unnamed(surplus), wait)
 
     def _twice_wrong(self, rows: _Index, plots: _Index, wrong: _Array) -> npt.NDArray[np.bool_]:
         """Say which tracks have begun wrongly: tentative ones with two faulty plots in a row.
@@ -168,6 +171,19 @@ class Tracker:
         life = self._life
         twice = (life.status[rows] == TENTATIVE) & (wrong > 0.5) & (life.p_fault[rows] > 0.5)
         return np.asarray(twice & (self._m.time[plots] > life.time[rows]))
+
+    def _surplus(self, rows: _Index, plots: _Index) -> _Index:
+        """Return plots that tracks took as faulty while their right ones came one period apart, as if none were.
+
+        A target gives one plot a period, so they are another's. Each begins a track, if none has begun with it.
+        """
+        m, life = self._m, self._life
+        taken, right = life.plot[rows], life.sound[rows]
+        one = (m.source[taken] == m.source[plots]) & (m.source[right] == m.source[plots])
+        usual = m.time[plots] - m.time[right] < _SURPLUS * self._periods[m.source[plots]]
+        taken = taken[(life.p_fault[rows] > 0.5) & one & usual]
+        live = life.rows()
+        return np.asarray(taken[~np.isin(taken, life.plot[live[life.status[live] == SEED]])])
 
     def _update(self, rows: _Index, gated: Gated, pairs: _Index, log_weights: _Array, p: _Array) -> None:
         """Condition tracks on the plots chosen, each a mixture of what may be wrong with it.
@@ -207,9 +223,9 @@ class Tracker:
         settings, m, life = self._settings, self._m, self._life
         track, plot = gated.pairs.track, index[gated.pairs.plot]
         detection = settings.detection_probability
-        gain = log_f - np.log(self._density[m.source[plot]]) + np.log(detection / (1.0 - detection))
-        has_height = np.isfinite(m.position[plot, 2])
-        gain = gain + np.where(gated.height_used, np.log((1.0 - settings.altitude_outlier) * _HEIGHT_SPAN), 0.0)
+        gain = log_f - np.log(self._background.plane[plot]) + np.log(detection / (1.0 - detection))
+        has_height, new_height = np.isfinite(m.position[plot, 2]), self._background.height[plot]
+        gain = gain + np.where(gated.height_used, np.log((1.0 - settings.altitude_outlier) / new_height), 0.0)
         gain = gain + np.where(has_height & ~gated.height_used, np.log(settings.altitude_outlier), 0.0)
         gain = gain + _STANDING[life.status[track]]
         if self._use_identity:
@@ -263,11 +279,14 @@ class Tracker:
     def _also_begin(self, plots: _Index, used: _Index, wait: float) -> None:
         """Begin tracks with plots that others took as faulty: they may be right ones of a target not yet known.
 
-        They stay with the track that took them. An address settles whose a plot is.
+        They stay with the track that took them.
         """
-        if self._use_identity:
-            plots = plots[self._m.icao24[plots] < 0]
+        plots = self._unnamed(plots)
         self._seed(plots[~self._split_from(plots, np.setdiff1d(used, plots))], wait)
+
+    def _unnamed(self, plots: _Index) -> _Index:
+        """Leave out plots with an address, which settles whose they are."""
+        return plots[(self._m.icao24[plots] < 0) | (not self._use_identity)]
 
     def _split_from(self, plots: _Index, used: _Index) -> npt.NDArray[np.bool_]:
         settings = self._settings
