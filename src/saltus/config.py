@@ -14,6 +14,7 @@ sigma_range = 30.0                # optional noise: m,
 sigma_azimuth = 0.08              # degrees,
 sigma_xy = 10.0                   # m (plane and geodetic positions),
 sigma_altitude = 8.0              # m
+sigma_time = 0.06                 # s (time stamps of positions)
 period = 4.0                      # optional: s between two reports of one target
 correlation_time = 5.0            # optional: s that errors last
 system = "platform"               # optional: sources of one system make common local tracks
@@ -56,6 +57,7 @@ _HINTS = {
     "sigma_azimuth": "one standard deviation in degrees, above 0 and up to 10",
     "sigma_xy": "one standard deviation in m, above 0 and up to 10000",
     "sigma_altitude": "one standard deviation in m, above 0 and up to 10000",
+    "sigma_time": "one standard deviation in s, 0 to 10",
     "correlation_time": "s, above 0 and up to 3600",
     "name": 'text, as name = "BCN"',
     "system": 'text, as system = "platform"',
@@ -86,6 +88,7 @@ class SensorConfig(BaseModel):
     sigma_azimuth: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     sigma_xy: _Sigma | None = None
     sigma_altitude: _Sigma | None = None
+    sigma_time: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
     period: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
     correlation_time: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
     system: str = ""

@@ -23,10 +23,15 @@ __all__ = ["SIGMAS", "Sensors", "Tracked", "health_of", "noise_rows", "reported_
 _DOUBTFUL_NIS = 3.0  # of two degrees of freedom
 _TOO_SMALL_NIS = 0.3
 _FAR_OFF = 30.0  # factor between a configured standard deviation and the estimate of it
-_UNITS = {"sigma_range_m": "σ of range, m", "sigma_azimuth_deg": "σ of azimuth, °", "sigma_xy_m": "σ of position, m"}
+_UNITS = {
+    "sigma_range_m": "σ of range, m",
+    "sigma_azimuth_deg": "σ of azimuth, °",
+    "sigma_xy_m": "σ of position, m",
+    "sigma_time_s": "σ of time stamps, s",
+}
 SIGMAS = {  # by what a source reports: label, field of Noise, unit
     Kind.POLAR: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
-    Kind.PLANE: (("sigma_xy_m", "xy", 1.0),),
+    Kind.PLANE: (("sigma_xy_m", "xy", 1.0), ("sigma_time_s", "time", 1.0)),
     Kind.BEARING: (("sigma_azimuth_deg", "azimuth", 180.0 / np.pi),),
 }
 

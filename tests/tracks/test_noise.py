@@ -84,6 +84,36 @@ def test_plane_noise_is_recovered_per_source(rng):
         assert np.isnan(found.azimuth)
 
 
+def stamped(rng, speeds, sigma, late, n=600, period=0.5):
+    """Straight flights, reported at times that are off by `late`, all axes noisy by sigma; and whose each report is."""
+    k = len(speeds)
+    course, time = rng.uniform(0.0, 2.0 * np.pi, k), period * np.arange(n)
+    velocity = np.asarray(speeds)[:, None] * np.stack([np.sin(course), np.cos(course)], axis=-1)
+    when = time + late * rng.standard_normal((k, n))
+    xy = velocity[:, None] * when[..., None] + sigma * rng.standard_normal((k, n, 2))
+    m, label = measured(np.tile(time, k), xy.reshape(-1, 2), sigma), np.repeat(np.arange(1, k + 1), n)
+    return m, label[np.argsort(np.tile(time, k), kind="stable")]
+
+
+def test_errors_of_time_stamps_are_found_along_the_course(rng):
+    """Two reports a second: over seven of them in a row, what a position errs by would be taken for a turn."""
+    m, label = stamped(rng, np.linspace(60.0, 240.0, 10), 2.0, 0.06)
+    found = estimate_noise(m, label, 0)
+    assert found.xy == pytest.approx(2.0, rel=0.05)
+    assert found.time == pytest.approx(0.06, rel=0.05)
+    assert apply_estimate(Noise(), found, Source(System(21, 1, 1))).time == found.time
+    exact = estimate_noise(*stamped(rng, np.linspace(60.0, 240.0, 10), 2.0, 0.0), 0)
+    assert exact.time < 0.005
+
+
+def test_slow_targets_tell_nothing_of_time_stamps(rng):
+    m, label = stamped(rng, np.full(10, 10.0), 2.0, 0.06)
+    found = estimate_noise(m, label, 0)
+    assert np.isnan(found.time)
+    assert found.xy == pytest.approx(2.0, rel=0.1)
+    assert apply_estimate(Noise(time=0.05), found, Source(System(21, 1, 1))).time == 0.05
+
+
 def test_turns_are_left_out(rng):
     """Targets turning at 3 degrees a second and 220 m/s pull 11 m/s^2: no window is straight enough."""
     m, label = seen_by(rng, 3.5, np.radians(0.007), n=4, turn=float(np.radians(3.0)))
@@ -113,13 +143,13 @@ def test_gaps_and_few_plots_give_nothing(rng):
 def test_never_below_quantisation():
     source = Source(System(48, 1, 2), range_lsb=1852 / 256, azimuth_lsb=2 * np.pi / 65536, xy_lsb=1.0)
     start = Noise()
-    tiny = apply_estimate(start, NoiseEstimate(0.1, 1e-9, 0.01, 500), source)
+    tiny = apply_estimate(start, NoiseEstimate(0.1, 1e-9, 0.01, np.nan, 500), source)
     assert tiny.range == pytest.approx(7.234375 / 3.4641016, rel=1e-7)
     assert tiny.azimuth == pytest.approx(9.5873799e-5 / 3.4641016, rel=1e-7)
     assert tiny.xy == pytest.approx(1 / 3.4641016, rel=1e-7)
-    real = apply_estimate(start, NoiseEstimate(30.0, 1e-3, 5.0, 500), source)
+    real = apply_estimate(start, NoiseEstimate(30.0, 1e-3, 5.0, np.nan, 500), source)
     assert (real.range, real.azimuth, real.xy) == (30.0, 1e-3, 5.0)
-    assert apply_estimate(start, NoiseEstimate(np.nan, np.nan, np.nan, 0), source) == start
+    assert apply_estimate(start, NoiseEstimate(np.nan, np.nan, np.nan, np.nan, 0), source) == start
 
 
 def test_estimate_of_quantised_plots_stays_above_the_step(rng):

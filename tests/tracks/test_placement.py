@@ -9,7 +9,7 @@ from saltus.errors import DataError
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots, Source, System
 from saltus.run.command import _noise
-from saltus.tracks.measurements import Noise, make_plane, place_plots
+from saltus.tracks.measurements import Noise, default_noise, make_plane, place_plots
 
 N = 30
 NOISE = Noise(range=3.0, azimuth=0.01, elevation=0.02, xy=2.0, altitude=1.0)
@@ -110,6 +110,23 @@ def test_errors_that_last_average_to_what_the_filter_believes(tau):
     cov = 4.0 * a ** np.abs(k[:, None] - k)
     assert given["xy"] ** 2 * given["inflation"] / n == pytest.approx(cov.mean(), rel=0.05)
     assert "inflation" not in _noise(SensorConfig(name="ship", sigma_xy=2.0), period=0.5)
+
+
+@pytest.mark.parametrize(("told", "time"), [({"sigma_time": 0.05}, 0.05), ({"sigma_xy": 3.0}, 0.0), ({}, None)])
+def test_a_position_whose_noise_is_configured_has_exact_times_unless_told(told, time):
+    assert _noise(SensorConfig(name="ship", **told), period=0.5).get("time") == time
+
+
+@pytest.mark.parametrize(("category", "time"), [(21, 0.2 / np.sqrt(12.0)), (10, 0.0)])
+def test_transponders_send_positions_a_little_off_their_time(sea, category, time):
+    assert default_noise(Source(System(category, 1, 1))).time == time
+    ship, (x, y, _), _ = sea
+    noise = {0: Noise(time=0.3)}
+    m = place_plots(reports(ship, Kind.PLANE, x=x, y=y), Plane(1.1, 0.18), [None], noise, (0.0, 30.0))
+    velocity = np.column_stack([np.arange(len(m)), np.full(len(m), 2.0)])
+    added = m.stamped(np.arange(len(m)), velocity)
+    np.testing.assert_allclose(added[:, :2, :2], 0.09 * np.einsum("ki,kj->kij", velocity, velocity))
+    assert not added[:, 2].any() and not added[:, :, 2].any()
 
 
 def test_inflation_is_the_source_s(sea):

@@ -11,6 +11,7 @@ from saltus.geo import Plane
 from saltus.metrics import false_tracks, track_scores
 from saltus.simulate import Leg, Radar, Trajectory, observe
 from saltus.tracks.lifecycle import CONFIRMED
+from saltus.tracks.local import local_system
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.tracker import Tracker
 
@@ -258,6 +259,35 @@ def test_a_target_that_reports_seldom_gets_a_track(rng):
     assert len(np.unique(found.track_id[parked])) == 1 and found.track_id[parked][0] > 0
     assert len(np.unique(found.track_id[~parked])) == 1
     assert not run(m, periods=(0.5,)).track_id[parked].any()
+
+
+def test_a_late_time_stamp_is_no_manoeuvre(rng):
+    """Reports twice a second, their times off by 0.06 s: 12 m along the course, of which the filter knows."""
+    n, k, late = 240, 20, 0.06
+    time = 0.5 * np.arange(float(n))
+    course = rng.uniform(0.0, 2.0 * np.pi, k)
+    velocity = 200.0 * np.stack([np.sin(course), np.cos(course)], axis=-1)
+    when = time + late * rng.standard_normal((k, n))
+    start = 60e3 * np.stack([np.arange(k) % 5, np.arange(k) // 5], axis=-1)
+    xy = (start[:, None] + velocity[:, None] * when[..., None]).reshape(-1, 2) + 2.0 * rng.standard_normal((n * k, 2))
+    m = measured(np.tile(time, k), xy, 2.0)
+    known = replace(m, jitter=np.full(len(m), late))
+    well = TrackerSettings(degraded_noise=1.0)  # else the source would be taken for degraded
+    told, untold = (run(reports, periods=(0.5,), settings=well) for reports in (known, m))
+    assert len(np.unique(told.track_id)) == k
+    speed, p = [], []
+    for found in (told, untold):
+        settled, moments = found.rows.time > 20.0, found.rows.moments
+        speed.append(np.sqrt(np.mean((np.hypot(moments.mean[settled, 1], moments.mean[settled, 3]) - 200.0) ** 2)))
+        p.append(moments.p_manoeuvre_h[settled].mean())
+    assert 1.6 < np.nanmean(told.rows.d2) < 2.1  # a little doubt of manoeuvres is left in steady flight
+    assert p[0] < 0.1 < 0.5 < p[1]
+    assert speed[0] < 1.0 < 8.0 < speed[1]
+    # Identification counts a report's error along its course as well.
+    view = local_system("", known, told.raw, told.all_rows, np.full(len(m), -1), use_identity=False).view
+    R, v = view.tracks.R[view.tracks.time > 20.0], view.velocity[view.tracks.time > 20.0]
+    along = np.einsum("ni,nij,nj->n", v, R, v) / (v**2).sum(axis=1)
+    assert np.median(along) == pytest.approx((200.0 * late) ** 2 + 4.0, rel=0.1)
 
 
 def test_targets_that_report_in_turn_get_their_own_tracks(rng):

@@ -51,6 +51,7 @@ def measured(time, xy, sigma, *, altitude=None, sigma_altitude=10.0, source=0, i
         origin=np.full((n, 2), np.nan),
         bearing=np.full(n, np.nan),
         sigma_bearing=np.full(n, np.nan),
+        jitter=np.zeros(n),
         inflation=np.ones(n),
     )
 

@@ -288,6 +288,7 @@ def _noise(sensor: SensorConfig, period: float) -> dict[str, float]:
         "azimuth": azimuth,
         "xy": sensor.sigma_xy,
         "altitude": sensor.sigma_altitude,
+        "time": 0.0 if sensor.sigma_time is None and sensor.sigma_xy is not None else sensor.sigma_time,
         "inflation": sensor.correlation_time and float(1.0 / np.tanh(0.5 * period / sensor.correlation_time)),
     }
     return {field: value for field, value in given.items() if value is not None}

@@ -83,11 +83,12 @@ class Gate:
         offset = np.minimum(dt, 0.0)  # a plot of another source may come a little late
         copies = kinematics.predicted(near.track, np.maximum(dt, 0.0))
         every = np.arange(len(dt))
-        z, R = m.position[plot], m.cov[plot]
+        late = m.stamped(plot, life.mean[near.track][:, _VELOCITY[:2]])
+        z, R = m.position[plot], m.cov[plot] + late
         y, S = _measured(*copies.widest(every), offset, R)
         d2_gate, d2_height = _distances(z - y, S)
         trusted = (life.status[near.track] == CONFIRMED) | self._same_address(near, life, m, index)
-        faulty = self._faulty(d2_gate, trusted, z - y, S - R, m, plot, source, prior)
+        faulty = self._faulty(d2_gate, trusted, z - y, S - R + late, m, plot, source, prior)
         inside = np.flatnonzero((d2_gate <= self.horizontal) | faulty)
         mixture = copies.moments(inside)
         y_mixture, S_mixture = _measured(mixture.mean, mixture.cov, offset[inside], R[inside])
@@ -95,7 +96,7 @@ class Gate:
         d2, _ = _distances(z - y_mixture, S_mixture)
         height_used = np.isfinite(z[:, 2]) & (d2_height[inside] <= self.height)
         z[~height_used, 2] = np.nan
-        covs = source.law.covariances(m, plot) * m.inflation[plot, None, None, None]
+        covs = (source.law.covariances(m, plot) + late[inside, None]) * m.inflation[plot, None, None, None]
         return Gated(
             Pairs(near.track[inside], near.plot[inside]),
             Plan(z, covs[:, 0], offset[inside]),
@@ -155,16 +156,20 @@ class Gate:
         dt = np.maximum(middle - life.time[rows], 0.0)
         velocity = life.mean[rows][:, _VELOCITY[:2]]
         position = life.mean[rows][:, _POSITION[:2]] + dt[:, None] * velocity
-        reach = self._reach(life, rows, dt + half, float(bounds.spread(m, index).max()))
+        speed = np.hypot(velocity[:, 0], velocity[:, 1])
+        variance = float(bounds.spread(m, index).max()) + (float(m.jitter[index].max()) * speed) ** 2
+        reach = self._reach(life, rows, dt + half, variance)
         reach = reach + np.where(life.status[rows] == CONFIRMED, float(self._astray(m, index, bounds).max()), 0.0)
-        return near_pairs(position, reach + np.hypot(velocity[:, 0], velocity[:, 1]) * half, m.position[index, :2])
+        return near_pairs(position, reach + speed * half, m.position[index, :2])
 
     def _close(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index, bounds: "_Bounds") -> Pairs:
         """Keep the pairs that the same radius allows at the plot's own time."""
         track, plot = pairs.track, index[pairs.plot]
         dt = m.time[plot] - life.time[track]
-        position = life.mean[track][:, _POSITION[:2]] + dt[:, None] * life.mean[track][:, _VELOCITY[:2]]
-        reach = self._reach(life, track, np.abs(dt), bounds.spread(m, plot))
+        velocity = life.mean[track][:, _VELOCITY[:2]]
+        position = life.mean[track][:, _POSITION[:2]] + dt[:, None] * velocity
+        variance = bounds.spread(m, plot) + m.jitter[plot] ** 2 * np.square(velocity).sum(axis=1)
+        reach = self._reach(life, track, np.abs(dt), variance)
         reach = reach + np.where(life.status[track] == CONFIRMED, self._astray(m, plot, bounds), 0.0)
         keep = np.linalg.norm(m.position[plot, :2] - position, axis=-1) <= reach
         return Pairs(track[keep], pairs.plot[keep])

@@ -88,7 +88,7 @@ def local_system(
     sure = rows.status == 2
     ready = np.full(len(ids), np.inf)
     np.minimum.at(ready, np.searchsorted(ids, rows.track_id[sure]), rows.time[sure])
-    R = m.cov[at, :2, :2] * m.inflation[at, None, None]
+    R = (m.cov[at] + m.stamped(at, velocity[at]))[:, :2, :2] * m.inflation[at, None, None]
     noise = float(np.sqrt(np.median(np.trace(R, axis1=-2, axis2=-1)) / 2.0)) if len(at) else np.inf
     R = R * _misfit(track, m.time[at], m.position[at, :2], R)[:, None, None]
     icao24 = np.array([_commonest(m.icao24[at], track, k) for k in range(len(ids))], np.int64)

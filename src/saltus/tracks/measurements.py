@@ -32,6 +32,8 @@ _Array = npt.NDArray[np.float64]
 # multilateration, ADS-B with good satellite navigation, heights in steps of 100 ft.
 _RANGE, _AZIMUTH, _ELEVATION, _XY, _ALTITUDE = 50.0, np.radians(0.08), np.radians(0.3), 20.0, 10.0
 _SURFACE, _GROUND_RELIEF = 10, 20.0  # ASTERIX category of surface movement; m
+# A transponder without a clock of its own sends a position up to 0.1 s off the time it is received at.
+_ADSB, _STAMP = 21, 0.2 / np.sqrt(12.0)  # ASTERIX category; s
 _SMALLEST_AREA = 1e6  # m^2
 _HULL, _RESOLUTION = 75.0, 15.0  # m, and in standard deviations: how far two plots of one target differ
 _SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
@@ -39,8 +41,9 @@ _SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations of one source's measurements: m and rad, each report's error by itself.
+    """Standard deviations of one source's measurements: m, rad and s, each report's error by itself.
 
+    `time` is that of the time stamps: a position is where the target was a little sooner or later.
     `inflation` multiplies their squares where a report updates a filter: errors that last from report to report tell
     less than as many independent ones. Gates do without it.
     """
@@ -50,6 +53,7 @@ class Noise:
     elevation: float = float(_ELEVATION)
     xy: float = _XY
     altitude: float = _ALTITUDE
+    time: float = 0.0
     inflation: float = 1.0
 
 
@@ -62,6 +66,7 @@ def default_noise(source: Source) -> Noise:
         azimuth=float(max(_AZIMUTH, source.azimuth_lsb / step)),
         xy=max(_XY, source.xy_lsb / step),
         altitude=max(_ALTITUDE, source.altitude_lsb / step),
+        time=_STAMP if source.system.category == _ADSB else 0.0,
     )
 
 
@@ -83,6 +88,7 @@ class Measurements:
     origin: _Array  # (N, 2): plane x, y of the observer of a bearing, m; NaN where there is a position instead
     bearing: _Array  # (N,): rad from the plane's y axis, clockwise; NaN likewise
     sigma_bearing: _Array  # (N,): rad; NaN likewise
+    jitter: _Array  # (N,): standard deviation of the time stamp, s
     inflation: _Array  # (N,): of the variance, where a measurement updates a filter
 
     def __len__(self) -> int:
@@ -108,6 +114,13 @@ class Measurements:
         unknown = np.isnan(position[:, 2])
         position[unknown, 2], cov[unknown, 2, 2] = prior[0], prior[1] ** 2
         return position, cov
+
+    def stamped(self, index: npt.NDArray[np.intp], velocity: _Array) -> _Array:
+        """Return what errors of time stamps add to covariances, sigma^2 v v' (k, 3, 3), of velocities (k, 2), m/s."""
+        out = np.zeros((len(index), 3, 3))
+        way = self.jitter[index, None] * velocity
+        out[:, :2, :2] = way[:, :, None] * way[:, None, :]
+        return out
 
     def split_from(
         self, left: npt.NDArray[np.intp], used: npt.NDArray[np.intp], max_range: float, max_azimuth: float
@@ -221,6 +234,7 @@ def place_plots(
         origin=sights[:, :2],
         bearing=sights[:, 2],
         sigma_bearing=sights[:, 3],
+        jitter=np.array([noise[s].time for s in range(len(plots.sources))])[plots.source[usable]],
         inflation=np.array([noise[s].inflation for s in range(len(plots.sources))])[plots.source[usable]],
     )
 

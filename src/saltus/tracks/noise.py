@@ -13,7 +13,9 @@ __all__ = ["NoiseEstimate", "apply_estimate", "estimate_noise", "widened"]
 
 _Array = npt.NDArray[np.float64]
 
-_WINDOW = 7  # plots of one track in a row
+_WINDOW = 7  # plots of one track
+_STEP = 2.0  # s between them, or more: in less, what an aircraft's position errs by looks like a turn
+_FAST = 30.0  # m/s, from which errors of the time stamp show
 _MAX_ACCEL = 1.0  # m/s^2 over the window: straighter than any turn of an aircraft
 _MOVING = 3.0  # m/s
 _MAX_GAP = 2.5  # of the median interval: no window spans a longer gap
@@ -29,16 +31,18 @@ class NoiseEstimate(NamedTuple):
     range: float  # m
     azimuth: float  # rad
     xy: float  # m, each axis, for sources that give plane or geodetic positions
+    time: float  # s, of the time stamps of such sources
     n_windows: int
 
 
 def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int) -> NoiseEstimate:
     """Estimate one source's noise from the scatter of its plots about local quadratics in time.
 
-    For seven plots of one track in a row a quadratic x(t), y(t) is fitted by least squares; the residual e of the
-    middle plot has variance sigma^2 (1 - h), h its leverage, whatever constant acceleration the target has. Along
-    and across the ray from the radar, sigma is the root mean square of e / sqrt(1 - h) over all straight windows,
-    those beyond four median deviations (outliers, turns) left out.
+    For seven plots of one track, two seconds apart or more, a quadratic x(t), y(t) is fitted by least squares; the
+    residual e of the middle plot has variance sigma^2 (1 - h), h its leverage, whatever constant acceleration the
+    target has. Along and across the ray from the radar, sigma is the root mean square of e / sqrt(1 - h) over all
+    straight windows, those beyond four median deviations (outliers, turns) left out. Of positions, sigma is found
+    across the course, and from what is more along it the deviation of time stamps: of e / speed less sigma / speed.
 
     Args:
         m: measurements in time order.
@@ -47,24 +51,27 @@ def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int
     """
     index = np.flatnonzero((m.source == source) & (track_id > 0))
     index = index[np.lexsort((m.time[index], track_id[index]))]
-    if len(index) < _WINDOW:
-        return NoiseEstimate(np.nan, np.nan, np.nan, 0)
-    window = np.lib.stride_tricks.sliding_window_view(index, _WINDOW)
+    step = np.diff(m.time[index])[np.diff(track_id[index]) == 0]
+    every = max(1, round(_STEP / float(np.median(step[step > 0])))) if (step > 0).any() else 1
+    whole = (_WINDOW - 1) * every + 1
+    if len(index) < whole:
+        return NoiseEstimate(np.nan, np.nan, np.nan, np.nan, 0)
+    window = np.lib.stride_tricks.sliding_window_view(index, whole)[:, ::every]
     time = m.time[window] - m.time[window[:, _WINDOW // 2]][:, None]
     step = np.diff(m.time[window], axis=1)
     whole = (track_id[window] == track_id[window[:, :1]]).all(axis=1) & (step > 0).all(axis=1)
     whole &= step.max(axis=1) < _MAX_GAP * np.median(step[whole]) if whole.any() else False
-    residual, speed, accel = _middle_residuals(time[whole], m.position[window[whole], :2])
+    residual, velocity, accel = _middle_residuals(time[whole], m.position[window[whole], :2])
     straight = accel < _MAX_ACCEL
-    moving = straight & (speed > _MOVING)
+    moving = straight & (np.linalg.norm(velocity, axis=-1) > _MOVING)
     if moving.sum() >= _MIN_WINDOWS:  # what stands still repeats one rounded position and shows no noise
         straight = moving
     middle = window[whole, _WINDOW // 2][straight]
-    return _scatter(residual[straight], m.ray[middle])
+    return _scatter(residual[straight], velocity[straight], m.ray[middle])
 
 
 def _middle_residuals(time: _Array, xy: _Array) -> tuple[_Array, _Array, _Array]:
-    """Return the middle plots' residuals with variance sigma^2, (W, 2), fitted speeds and accelerations, (W,)."""
+    """Return the middle plots' residuals with variance sigma^2, fitted velocities, (W, 2), and accelerations, (W,)."""
     scale = np.abs(time).max(axis=1, initial=0.0)[:, None]
     u = time / np.where(scale > 0, scale, 1.0)
     A = np.stack([np.ones_like(u), u, u * u], axis=-1)
@@ -74,21 +81,33 @@ def _middle_residuals(time: _Array, xy: _Array) -> tuple[_Array, _Array, _Array]
     leverage = pinv[:, 0, _WINDOW // 2]  # the middle plot is at u = 0
     residual = -coefficients[:, 0] / np.sqrt(1.0 - leverage)[:, None]
     unit = np.maximum(scale[:, 0], 1e-9)
-    speed, accel = np.linalg.norm(coefficients[:, 1:], axis=-1).T / np.stack([unit, 0.5 * unit**2])
-    return residual, speed, accel
+    return residual, coefficients[:, 1] / unit[:, None], 2.0 * np.linalg.norm(coefficients[:, 2], axis=-1) / unit**2
 
 
-def _scatter(residual: _Array, ray: _Array) -> NoiseEstimate:
+def _scatter(residual: _Array, velocity: _Array, ray: _Array) -> NoiseEstimate:
     n = len(residual)
     if n < _MIN_WINDOWS:
-        return NoiseEstimate(np.nan, np.nan, np.nan, n)
+        return NoiseEstimate(np.nan, np.nan, np.nan, np.nan, n)
     if np.isnan(ray).any():
-        return NoiseEstimate(np.nan, np.nan, _trimmed(residual), n)
+        return NoiseEstimate(np.nan, np.nan, *_of_positions(residual, velocity), n)
     distance = np.linalg.norm(ray, axis=-1)
     u = ray / distance[:, None]
     along = residual[:, 0] * u[:, 0] + residual[:, 1] * u[:, 1]
     across = (residual[:, 1] * u[:, 0] - residual[:, 0] * u[:, 1]) / distance
-    return NoiseEstimate(_trimmed(along), _trimmed(across), np.nan, n)
+    return NoiseEstimate(_trimmed(along), _trimmed(across), np.nan, np.nan, n)
+
+
+def _of_positions(residual: _Array, velocity: _Array) -> tuple[float, float]:
+    """Return the standard deviations of positions, m, and of their time stamps, s (NaN where too few are fast)."""
+    speed = np.linalg.norm(velocity, axis=-1)
+    fast = speed > _FAST
+    if fast.sum() < _MIN_WINDOWS:
+        return _trimmed(residual), np.nan
+    moving = speed > _MOVING
+    u = velocity[moving] / speed[moving, None]
+    xy = _trimmed(residual[moving, 1] * u[:, 0] - residual[moving, 0] * u[:, 1])
+    late = (residual[fast] * velocity[fast]).sum(axis=-1) / speed[fast] ** 2
+    return xy, float(np.sqrt(max(0.0, _trimmed(late) ** 2 - xy**2 * np.mean(speed[fast] ** -2.0))))
 
 
 def _trimmed(e: _Array) -> float:
@@ -108,6 +127,7 @@ def apply_estimate(noise: Noise, estimate: NoiseEstimate, source: Source) -> Noi
         range=at_least(estimate.range, source.range_lsb, noise.range),
         azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth),
         xy=at_least(estimate.xy, source.xy_lsb, noise.xy),
+        time=estimate.time if np.isfinite(estimate.time) else noise.time,
     )
 
 
@@ -125,4 +145,5 @@ def widened(noise: Noise, d2: _Array) -> Noise:
     if len(d2) < _MIN_WINDOWS:
         return noise
     factor = float(np.sqrt(max(1.0, float(np.quantile(d2, _SHARE)) / _CHI2_QUANTILE)))
-    return replace(noise, range=noise.range * factor, azimuth=noise.azimuth * factor, xy=noise.xy * factor)
+    wider = {name: getattr(noise, name) * factor for name in ("range", "azimuth", "xy", "time")}
+    return replace(noise, **wider)

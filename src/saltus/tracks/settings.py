@@ -163,7 +163,7 @@ class SystemsSettings:
     """When tracks of two systems become one.
 
     Attributes:
-        reference: name of the system whose positions hold; "" = that with the smallest stated noise.
+        reference: name of the system whose positions hold; "" = that with the smallest stated noise, radars last.
         p_false: largest probability of being two objects with which two tracks are declared one.
         p_false_split: the same for two tracks of one radar, second echoes of an object in motion.
         split_offset: standard deviation of the distance between two echoes of one object, each axis, m.

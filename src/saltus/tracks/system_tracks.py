@@ -261,7 +261,7 @@ def _anew(
     index, begin = lanes.number, np.flatnonzero(is_first(lanes.piece))
     start = _start(rows, lanes, begin, m, scene.parts, scene.owner)
     several = in_several(lanes.piece, scene.owner[index])
-    cov = m.cov[index] * m.inflation[index, None, None]
+    cov = (m.cov[index] + m.stamped(index, scene.velocity[index])) * m.inflation[index, None, None]
     cov[:, :2, :2] += several[:, None, None] * (0.5 * lasting**2 * np.eye(2) + scene.doubt[index])
     faulty = _faulty(m, index, settings) + (cov - m.cov[index])[:, None]
     lane = np.cumsum(is_first(lanes.piece)) - 1

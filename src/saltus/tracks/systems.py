@@ -42,7 +42,7 @@ def register_all(
     if settings.reference and settings.reference not in names:
         raise ModelError(f"systems.reference = {settings.reference!r} names none of the systems: {', '.join(names)}.")
     pairing = pairing_settings(systems, settings, 0.0)
-    order = sorted(range(len(systems)), key=lambda k: (systems[k].name != settings.reference, systems[k].noise))
+    order = sorted(range(len(systems)), key=lambda k: (systems[k].name != settings.reference, *_trust(systems[k])))
     done = {order[0]: systems[order[0]]}
     how = {order[0]: Registered(systems[order[0]].name, "", None)}
     for k in order[1:]:
@@ -51,6 +51,11 @@ def register_all(
         how[k] = Registered(systems[k].name, systems[best].name, tried[best])
         done[k] = _moved(systems[k], tried[best])
     return [done[k] for k in range(len(systems))], [how[k] for k in range(len(systems))]
+
+
+def _trust(system: LocalSystem) -> tuple[bool, float]:
+    """Rank systems, the most trusted first: a radar has a north of its own, of others the finest goes first."""
+    return bool(np.isfinite(system.view.ray).any()), system.noise
 
 
 def _moved(system: LocalSystem, found: Registration) -> LocalSystem:

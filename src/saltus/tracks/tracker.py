@@ -238,7 +238,9 @@ class Tracker:
         if not len(rows):
             return
         first, dt = life.plot[rows], m.time[plots] - life.time[rows]
-        start = two_point_start(*m.with_height(first, prior), *m.with_height(plots, prior), dt)
+        velocity = (m.position[plots, :2] - m.position[first, :2]) / dt[:, None]
+        (z0, R0), (z1, R1) = m.with_height(first, prior), m.with_height(plots, prior)
+        start = two_point_start(z0, R0 + m.stamped(first, velocity), z1, R1 + m.stamped(plots, velocity), dt)
         start = with_speed_prior(start, self._settings.max_speed)
         # The target may have manoeuvred between the two.
         start.cov[:, [1, 3], [1, 3]] += self._mean_accel_sq * (0.5 * dt[:, None]) ** 2
