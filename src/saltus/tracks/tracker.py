@@ -271,6 +271,8 @@ class Tracker:
 
     def _begin(self, plots: _Index, used: _Index, wait: float) -> None:
         """Mark plots left over that are split or contradict their address; begin a track with every other one."""
+        if not len(plots):
+            return
         split = self._split_from(plots, used)
         elsewhere = self._life.holds(self._m.icao24[plots]) & self._use_identity & ~split
         self._split[plots[split]], self._elsewhere[plots[elsewhere]] = True, True
@@ -284,7 +286,8 @@ class Tracker:
         They stay with the track that took them.
         """
         plots = self._unnamed(plots)
-        self._seed(plots[~self._split_from(plots, np.setdiff1d(used, plots))], wait)
+        if len(plots):
+            self._seed(plots[~self._split_from(plots, np.setdiff1d(used, plots))], wait)
 
     def _unnamed(self, plots: _Index) -> _Index:
         """Leave out plots with an address, which settles whose they are."""
@@ -296,6 +299,8 @@ class Tracker:
 
     def _seed(self, plots: _Index, wait: float) -> _Index:
         """Begin a track with every plot."""
+        if not len(plots):
+            return np.zeros(0, np.intp)
         m, life, settings = self._m, self._life, self._settings
         mean, cov = np.zeros((len(plots), 6)), np.zeros((len(plots), 6, 6))
         mean[:, 0::2], cov[:, 0::2, 0::2] = m.with_height(plots, settings.height_prior)
