@@ -36,6 +36,20 @@ def test_older_track_survives():
     assert got[1] == [(10, 40, 2, 1.0), (40, 90, 1, 0.97)]
 
 
+def test_a_number_stays_with_the_tracks_that_have_measurements():
+    """A centre's track, older, is found one with a measured one, given up again, and found once more."""
+    begin, end = np.array([0.0, 10.0]), np.array([100.0, 90.0])
+    rows = episodes((0, 1, 40, 60, 0.97), (0, 1, 70, 90, 0.95))
+    found = segments(begin, begin + 3.0, end, rows, 5.0, foreign=np.array([True, False]))
+    mine = found.track == 1
+    assert len(np.unique(found.system_track[mine])) == 1
+    np.testing.assert_array_equal(found.probability[mine], 1.0)
+    assert found.time_from[mine].min() == 10.0 and found.time_to[mine].max() == 90.0
+    assert len(np.unique(found.system_track[~mine])) > 1
+    measured = segments(begin, begin + 3.0, end, rows, 5.0)
+    assert len(np.unique(measured.system_track[measured.track == 1])) > 1
+
+
 def test_quick_decision_holds_from_the_beginning():
     _, got = cut([0, 10], [100, 90], (0, 1, 17, 90, 0.97))
     assert got[1] == [(10, 90, 1, 0.97)]

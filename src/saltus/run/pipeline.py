@@ -133,7 +133,10 @@ def _identified(local: Sequence[LocalSystem], settings: SystemsSettings, expecte
         begin.append(tracks.time[first])
         end.append(tracks.time[last])
     ready = np.concatenate([s.ready for s in local])
-    lives = segments(np.concatenate(begin), ready, np.concatenate(end), decisions.episodes, settings.settle)
+    foreign = np.repeat([not s.own for s in local], [len(s.ids) for s in local])
+    lives = segments(
+        np.concatenate(begin), ready, np.concatenate(end), decisions.episodes, settings.settle, foreign=foreign
+    )
     return Identified(registered, how, lives, decisions, evidence)
 
 

@@ -45,11 +45,11 @@ class _Event(NamedTuple):
 
 
 class _Groups:
-    """System tracks as sets of local tracks; the older one survives when two meet."""
+    """System tracks as sets of local tracks; the older one survives when two meet, measured ones first."""
 
-    def __init__(self, begin: _Array, end: _Array) -> None:
+    def __init__(self, begin: _Array, end: _Array, foreign: npt.NDArray[np.bool_]) -> None:
         n = len(begin)
-        self._begin, self._end = begin, end
+        self._begin, self._end, self._foreign = begin, end, foreign
         self._closed = np.zeros(n, bool)
         self._of = np.zeros(n, np.int64)  # system track of each local track born, 0 none
         self._since = begin.copy()
@@ -63,20 +63,23 @@ class _Groups:
 
     def join(self, a: int, b: int, now: float) -> None:
         self._links.add((a, b))
-        x, y = int(self._of[a]), int(self._of[b])
+        x, y = sorted((int(self._of[a]), int(self._of[b])), key=lambda of: (self._unmeasured(of), of))
         if x != y:
-            self._move(np.flatnonzero(self._of == max(x, y)), min(x, y), now)
+            self._move(np.flatnonzero(self._of == y), x, now)
 
     def part(self, a: int, b: int, now: float) -> None:
         """Take a link away: what hangs together with the first member of the system track keeps it."""
         self._links.discard((a, b))
         members = np.flatnonzero(self._of == self._of[a])
         parts = self._components(members.tolist())
-        oldest = min(members.tolist(), key=lambda k: (self._begin[k], k))
+        oldest = min(members.tolist(), key=lambda k: (self._foreign[k], self._begin[k], k))
         for part in parts:
             if oldest not in part:
                 self._move(np.array(sorted(part)), self._next, now)
                 self._next += 1
+
+    def _unmeasured(self, of: int) -> bool:
+        return bool(self._foreign[self._of == of].all())
 
     def _components(self, members: list[int]) -> list[set[int]]:
         parts: list[set[int]] = []
@@ -106,7 +109,15 @@ class _Groups:
             self._close(k)
 
 
-def segments(begin: _Array, ready: _Array, end: _Array, episodes: Episodes, settle: float) -> Segments:
+def segments(
+    begin: _Array,
+    ready: _Array,
+    end: _Array,
+    episodes: Episodes,
+    settle: float,
+    *,
+    foreign: npt.NDArray[np.bool_] | None = None,
+) -> Segments:
     """Cut the lives of local tracks at the decisions about them.
 
     Two local tracks that are one object belong to one system track, the older one's, from the decision on; when the
@@ -120,8 +131,9 @@ def segments(begin: _Array, ready: _Array, end: _Array, episodes: Episodes, sett
         end: its last report, (K,), s.
         episodes: which tracks were one object, and when.
         settle: s.
+        foreign: which are another centre's, (K,); a number stays with the tracks that have measurements. None: none is.
     """
-    groups = _Groups(begin, end)
+    groups = _Groups(begin, end, np.zeros(len(begin), bool) if foreign is None else foreign)
     for event in sorted(_events(ready, end, episodes, settle)):
         if event.kind == _BIRTH:
             groups.birth(event.a)
@@ -136,7 +148,8 @@ def segments(begin: _Array, ready: _Array, end: _Array, episodes: Episodes, sett
         none = np.zeros(0)
         return Segments(none.astype(np.int64), none, none, none.astype(np.int64), none)
     track, since, until, of = (np.array(column) for column in zip(*sorted(groups.found), strict=True))
-    return Segments(track, since, until, _numbered(of, since), _probability(track, since, until, of, begin, episodes))
+    first = begin if foreign is None else begin + np.where(foreign, np.ptp(begin) + 1.0, 0.0)
+    return Segments(track, since, until, _numbered(of, since), _probability(track, since, until, of, first, episodes))
 
 
 def _events(ready: _Array, end: _Array, episodes: Episodes, settle: float) -> Iterable[_Event]:
