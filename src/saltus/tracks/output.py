@@ -25,6 +25,8 @@ __all__ = [
 
 _Array = npt.NDArray[np.float64]
 
+_VAGUE = 500.0  # m: standard deviation of an altitude that says nothing any more
+
 SPLIT = "split plot"
 ELSEWHERE = "address elsewhere"  # far from the track that has its address
 BEARING = "bearing alone"  # in no confirmed track's direction: it starts none
@@ -42,7 +44,8 @@ def track_table(rows: Rows, plane: Plane, plots: Plots, m: Measurements, sigma_p
     seen = rows.measurement >= 0
     push = np.where(seen[:, None], m.lever[rows.measurement] * sigma_pressure, 0.0)
     cov[:, 0:3:2, 0:3:2] += push[:, :, None] * push[:, None, :]
-    altitude = np.where(rows.has_altitude, mean[:, 4], np.nan)
+    told = rows.has_altitude & (cov[:, 4, 4] <= _VAGUE**2)
+    altitude = np.where(told, mean[:, 4], np.nan)
     true = plane.to_true(mean[:, :4], cov[:, :4, :4], altitude)
     ve, vn = true.velocity.T
     position, velocity = true.position_cov, true.velocity_cov
@@ -56,13 +59,13 @@ def track_table(rows: Rows, plane: Plane, plots: Plots, m: Measurements, sigma_p
             "altitude": _null_nan(altitude),
             "ve": ve,
             "vn": vn,
-            "vu": _null_nan(np.where(rows.has_altitude, mean[:, 5], np.nan)),
+            "vu": _null_nan(np.where(told, mean[:, 5], np.nan)),
             "course_deg": np.degrees(np.arctan2(ve, vn)) % 360.0,
             "speed_mps": np.hypot(ve, vn),
             "cov_ee": position[:, 0, 0],
             "cov_en": position[:, 0, 1],
             "cov_nn": position[:, 1, 1],
-            "cov_uu": _null_nan(np.where(rows.has_altitude, cov[:, 4, 4], np.nan)),
+            "cov_uu": _null_nan(np.where(told, cov[:, 4, 4], np.nan)),
             "cov_veve": velocity[:, 0, 0],
             "cov_vevn": velocity[:, 0, 1],
             "cov_vnvn": velocity[:, 1, 1],

@@ -333,7 +333,7 @@ def _published(
     nothing = np.full(len(lanes.number), -1)
     icao24, mode3a = (latest(c[lanes.number] if use_identity else nothing, lanes.track) for c in (m.icao24, m.mode3a))
     named = np.where(m.named[lanes.number] & use_identity, lanes.number, -1)
-    keep = seen | sure  # a tentative track is not coasted
+    keep = seen | (sure & (every.time <= m.time.max()))  # neither a tentative track is coasted, nor any after the end
     out = Rows(
         track_id=track,
         time=every.time,
