@@ -28,7 +28,7 @@ def row(nis, configured, estimated, updates=500):
     ],
 )
 def test_doubts(given, words):
-    lines = _doubts({"radar": given})
+    lines = _doubts({"radar": given}, several=False)
     assert len(lines) == len(words)
     for line, said in zip(lines, words, strict=True):
         assert line.startswith("radar: ") and said in line

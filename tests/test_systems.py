@@ -170,6 +170,10 @@ def test_gaps_of_one_system_are_bridged_and_a_third_joins(tmp_path):
     ids = found.tracks["track_id"].to_numpy()
     assert (np.diff(time[np.lexsort((time, ids))]) >= 0)[np.diff(np.sort(ids)) == 0].all()
     assert found.summary["systems"]["east"]["identified_with_another_system"] == 2 * n
+    assert time.max() < EPOCH + seconds  # nobody coasts beyond the last report
+    for bias in found.biases["systems"].values():
+        assert bias["relative_to"] == found.biases["reference"] == GLOBAL
+        assert bias["compared_with"] in {"west", "east", GLOBAL}
 
 
 def test_two_addresses_claim_one_object(tmp_path):
@@ -231,3 +235,60 @@ def test_reference_must_be_there(tmp_path, line):
     tables = [reports(rng, s, start, velocity, 60.0) for s in SITES]
     with pytest.raises(ModelError, match="nobody"):
         run(tmp_path, tables, extra=line)
+
+
+def test_one_address_far_apart_in_two_systems_is_said(tmp_path):
+    """A site half a degree off: nothing is common, and the addresses say why."""
+    rng = np.random.default_rng(8)
+    start, velocity = flights(5, rng, 200.0)
+    near = reports(rng, "mlat", start, velocity, 200.0, code="3C000{}".format)
+    far = reports(rng, "adsb", start, velocity, 200.0, code="3C000{}".format, offset=(0.0, 50e3))
+    found = run(tmp_path, [near, far])
+    (line,) = [p for p in found.summary["problems"] if "in common" in p]
+    assert line.startswith("mlat and adsb have 5 addresses in common, ")
+    assert 49.0 < float(line.split("common, ")[1].split(" km")[0]) < 51.0
+
+
+def test_addresses_at_no_common_time_are_said(tmp_path):
+    rng = np.random.default_rng(9)
+    start, velocity = flights(4, rng, 200.0)
+    first = reports(rng, "mlat", start, velocity, 200.0, code="3C000{}".format)
+    other = reports(rng, "adsb", start, velocity, 200.0, code="3C000{}".format)
+    later = [{**row, "time": row["time"] + 3600.0} for row in other]
+    found = run(tmp_path, [first, later])
+    assert any("have 4 addresses in common, and none at one time" in p for p in found.summary["problems"])
+
+
+def test_a_source_that_makes_no_track_is_named(tmp_path):
+    """A period a hundred times too short: every report is the first of a new target."""
+    rng = np.random.default_rng(10)
+    start, velocity = flights(5, rng, 200.0)
+    rows = sorted(reports(rng, "west", start, velocity, 200.0), key=lambda row: row["time"])
+    with (tmp_path / "west.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    lat, lon = np.degrees(PLANE.inverse(np.array(SITES["west"])))
+    site = f"latitude = {lat:.9f}\nlongitude = {lon:.9f}\nheight = 0.0\n"
+    (tmp_path / "c.toml").write_text(f'[[sensor]]\nname = "west"\nperiod = 0.04\n{site}')
+    summary = track_files([tmp_path / "west.csv"], tmp_path / "out", tmp_path / "c.toml", report=False)
+    assert any(f"west: {len(rows)} reports and no track: is its update period 0.04 s" in p for p in summary["problems"])
+
+
+def test_an_altitude_that_nobody_tells_any_more_is_null(tmp_path):
+    """It descends at 10 m/s for a minute, then reports no height: what would be far below ground is not published."""
+    time = np.arange(0.0, 300.0, 4.0)
+    with (tmp_path / "t.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["time", "source", "latitude", "longitude", "altitude_m"])
+        for t in time.tolist():
+            height = f"{900.0 - 10.0 * t:.0f}" if t < 60.0 else ""
+            writer.writerow([EPOCH + t, "adsb", 48.0 + 1e-3 * t, 11.0, height])
+    track_files([tmp_path / "t.csv"], tmp_path / "out", report=False)
+    tracks = pq.read_table(tmp_path / "out" / "tracks.parquet")
+    after = tracks["time"].to_numpy() - EPOCH
+    told = np.isfinite(tracks["altitude"].to_numpy(zero_copy_only=False).astype(float))
+    assert told[(after > 8.0) & (after < 70.0)].all() and not told[after > 200.0].any()
+    for column in ("vu", "cov_uu"):
+        values = tracks[column].to_numpy(zero_copy_only=False).astype(float)
+        np.testing.assert_array_equal(np.isfinite(values), told)

@@ -77,6 +77,8 @@ def summarise(
     tracks: pa.Table,
     assigned: pa.Table,
     problems: Sequence[str],
+    *,
+    several: bool = False,
 ) -> dict[str, object]:
     """Count reports, tracks and reasons, and state every source's noise.
 
@@ -88,6 +90,7 @@ def summarise(
         tracks: rows of tracks.parquet.
         assigned: rows of assignments.parquet.
         problems: lines for the user.
+        several: whether states are of several systems: what may last between those widens their innovations.
     """
     used = int(pc.sum(pc.is_valid(assigned["track_id"])).as_py() or 0)
     reasons = pc.value_counts(assigned["reason"].drop_null()).to_pylist()
@@ -111,7 +114,7 @@ def summarise(
         },
         "noise": noise,
         "faults": _fault_table(health_of(sensors, tracked)),
-        "problems": [*problems, *_doubts(noise)],
+        "problems": [*problems, *_doubts(noise, several=several)],
     }
 
 
@@ -186,7 +189,7 @@ def noise_rows(summary: dict[str, Any]) -> dict[str, object]:
     return rows
 
 
-def _doubts(noise: dict[str, Any]) -> list[str]:
+def _doubts(noise: dict[str, Any], *, several: bool) -> list[str]:
     """Say of which sources the innovations contradict the noise used."""
     return [
         f"{name}: NIS {row['nis_mean']} where 2 is expected: the errors are larger than the noise used explains "
@@ -197,7 +200,7 @@ def _doubts(noise: dict[str, Any]) -> list[str]:
     ] + [
         f"{name}: {why}; is a unit wrong (NM for m, radians for degrees), or sigma in the configuration?"
         for name, row in noise.items()
-        for why in _implausible(row)
+        for why in _implausible(row, several=several)
     ]
 
 
@@ -206,11 +209,11 @@ def _telling(row: dict[str, Any]) -> bool:
     return bool(abs(row["nis_mean"] - 2.0) * np.sqrt(row["nis_updates"]) > 4.0 * 2.0)
 
 
-def _implausible(row: dict[str, Any]) -> list[str]:
+def _implausible(row: dict[str, Any], *, several: bool) -> list[str]:
     """Say what of one source's noise cannot be as it is."""
     why = []
     nis = row["nis_mean"]
-    if nis is not None and nis < _TOO_SMALL_NIS and _telling(row):
+    if nis is not None and nis < _TOO_SMALL_NIS and _telling(row) and not several:
         why.append(f"NIS {nis} where 2 is expected: the errors are far smaller than the noise used")
     for label in (label for label in row if label.startswith("sigma")):
         configured, estimated = row[label]["configured"], row[label]["estimated"]
@@ -223,6 +226,10 @@ def _rounded(value: float) -> float | None:
     return float(f"{value:.4g}") if np.isfinite(value) else None
 
 
+def _or(value: float | None, otherwise: str) -> str:
+    return otherwise if value is None else str(value)
+
+
 def show_summary(summary: dict[str, Any], output: Path, report: bool, systems: Sequence[str] = ()) -> None:
     """Say on the screen what was done and where it lies; `systems`: lines on several systems."""
     reports, tracks = summary["reports"], summary["tracks"]
@@ -233,8 +240,8 @@ def show_summary(summary: dict[str, Any], output: Path, report: bool, systems: S
         if row["nis_mean"] is None and not any(row[label]["estimated"] for label in row if label.startswith("sigma")):
             continue  # no plots, or too few to say anything
         sigmas = ", ".join(
-            f"{label} {row[label]['used']} (configured {row[label]['configured'] or 'none'}, "
-            f"estimated {row[label]['estimated'] or 'unknown'})"
+            f"{label} {row[label]['used']} (configured {_or(row[label]['configured'], 'none')}, "
+            f"estimated {_or(row[label]['estimated'], 'unknown')})"
             for label in row
             if label.startswith("sigma")
         )

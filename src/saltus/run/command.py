@@ -21,6 +21,7 @@ from saltus.io.write import output_directory
 from saltus.progress import Progress, progress_bar
 from saltus.records import REASONS, Kind, Plots, Recording, Source
 from saltus.run.identified import (
+    address_lines,
     bias_tables,
     conflict_lines,
     identification_summary,
@@ -39,6 +40,7 @@ _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's h
 _DAY = 86400.0  # s
 _ADSB, _PARKED = 21, 5.0  # s: category, and how seldom a transponder at rest on the ground tells its position
 _REPORT = "report.html"
+_MANY = 100  # positions of a source that should have made a track
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
 
 
@@ -105,8 +107,13 @@ def write_tracks(
     assigned = assignment_table(plots, tracked.measurements, tracked.assignments)
     done = time.perf_counter()
     called = _called(plots.sources, sensors.names)
-    problems += conflict_lines(whole, called)
-    summary = summarise(inputs, plots, sensors, tracked, tracks, assigned, problems)
+    problems += [
+        *_without_tracks(plots, sensors, tracked),
+        *address_lines(whole, called),
+        *conflict_lines(whole, called),
+    ]
+    several = len(whole.systems) > 1
+    summary = summarise(inputs, plots, sensors, tracked, tracks, assigned, problems, several=several)
     summary["systems"] = identification_summary(whole)
     summary["settings"] = {
         "identity": identity,
@@ -237,6 +244,19 @@ def _site_wanted(source: Source, count: int) -> str:
         f"{system}: {count} reports are relative to a site whose position is not configured. Give it in a file "
         f"named with --config: a [[sensor]] table with {keys}, latitude, longitude (degrees), height (m).{moving}"
     )
+
+
+def _without_tracks(plots: Plots, sensors: Sensors, tracked: Tracked) -> list[str]:
+    """Say which sources gave many positions and no track."""
+    m, found = tracked.measurements, tracked.assignments
+    placed = np.isfinite(m.position[:, 0])
+    count = np.bincount(m.source[placed], minlength=len(plots.sources))
+    on = np.bincount(m.source[placed & np.isin(found.track_id, found.confirmed)], minlength=len(plots.sources))
+    return [
+        f"{sensors.names[s]}: {count[s]} reports and no track: is its update period {sensors.periods[s]:.3g} s? "
+        "Give period (s) in its [[sensor]] table."
+        for s in np.flatnonzero((count >= _MANY) & (on == 0))
+    ]
 
 
 def _nothing_left(plots: Plots, problems: Sequence[str]) -> str:

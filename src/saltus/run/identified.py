@@ -10,12 +10,14 @@ import pyarrow as pa
 from saltus.report.systems import CONFLICTS, SystemsFound
 from saltus.run.pipeline import Identified
 from saltus.tracks.bias import PARAMETERS
+from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.identities import decision_rule
 from saltus.tracks.membership import Segments
 from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.systems import Registered
 
 __all__ = [
+    "address_lines",
     "bias_tables",
     "conflict_lines",
     "identification_summary",
@@ -26,6 +28,7 @@ __all__ = [
 
 _LASTING = 20.0  # s: a conflict shorter than this is no line for the user
 _MOST_LINES = 8
+_FEWEST, _FAR = 3, 1000.0  # addresses in common, and m apart, from which a system's set-up is doubted
 
 
 def identification_table(whole: Identified) -> pa.Table:
@@ -59,7 +62,7 @@ def _with_own(whole: Identified) -> npt.NDArray[np.int64]:
 
 
 def bias_tables(whole: Identified) -> dict[str, Any]:
-    """Return every system's biases against the one it was compared with: reported minus true, as of the end.
+    """Return every system's biases against the reference: reported minus true, as of the end.
 
     `series` holds the estimates over time, each from what was known then.
     """
@@ -76,7 +79,7 @@ def _biases(r: Registered) -> dict[str, Any]:
     if found is None:
         return {}
     series = found.series
-    table: dict[str, Any] = {"relative_to": r.to, "common_objects": 0, "biases": {}}
+    table: dict[str, Any] = {"relative_to": r.to, "compared_with": r.by, "common_objects": 0, "biases": {}}
     table["not_estimated"] = found.not_estimated
     if not len(series.time):
         return table | {"series": []}
@@ -142,12 +145,49 @@ def conflict_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
         for c in found[:_MOST_LINES]
     ]
     if len(found) > _MOST_LINES:
-        lines.append(f"{len(found) - _MOST_LINES} more identity conflicts: see the report.")
+        lines.append(f"{len(found) - _MOST_LINES} more identity conflicts lasted {_LASTING:.0f} s or longer.")
     return lines
 
 
+def address_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
+    """Say of which two systems the same addresses are far from each other, or seen at other times."""
+    lines = []
+    for i, a in enumerate(whole.systems):
+        for b in whole.systems[i + 1 :]:
+            common = np.intersect1d(a.view.icao24[a.view.icao24 >= 0], b.view.icao24)
+            if len(common) < _FEWEST:
+                continue
+            apart = [d for d in (_apart(a.view, b.view, int(code)) for code in common) if np.isfinite(d)]
+            both = (
+                f"{titles.get(a.name, a.name)} and {titles.get(b.name, b.name)} have {len(common)} addresses in common"
+            )
+            if not apart:
+                lines.append(f"{both}, and none at one time: check dates and clocks.")
+            elif len(apart) >= _FEWEST and float(np.median(apart)) > _FAR:
+                far = float(np.median(apart)) / 1000.0
+                lines.append(f"{both}, {far:.1f} km apart at one time (median): check sites, units, dates and clocks.")
+    return lines
+
+
+def _apart(a: SystemTracks, b: SystemTracks, code: int) -> float:
+    """Median distance between the positions of one address in two systems while both have it, m; NaN if never."""
+    (ta, za), (tb, zb) = (_of(view, code) for view in (a, b))
+    inside = (ta >= tb[0]) & (ta <= tb[-1])
+    if not inside.any():
+        return float("nan")
+    at_b = np.column_stack([np.interp(ta[inside], tb, zb[:, axis]) for axis in (0, 1)])
+    return float(np.median(np.linalg.norm(za[inside] - at_b, axis=-1)))
+
+
+def _of(view: SystemTracks, code: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Times and positions of one address, in time order."""
+    rows = np.flatnonzero(np.isin(view.tracks.track, np.flatnonzero(view.icao24 == code)))
+    rows = rows[np.argsort(view.tracks.time[rows], kind="stable")]
+    return view.tracks.time[rows], view.tracks.z[rows]
+
+
 def system_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
-    """Say how each of several systems differs from the one it was compared with, and how much of it was identified."""
+    """Say how each of several systems differs from the reference, and how much of it was identified."""
     if len(whole.systems) < 2:
         return []
     counts, out = identification_summary(whole), []
@@ -160,7 +200,8 @@ def system_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
         told = ", ".join(_in_words(name, b) for name, b in _biases(r)["biases"].items()) or "no bias told"
         common = int(r.found.series.objects[-1]) if len(r.found.series.time) else 0
         pair = f"{titles.get(r.name, r.name)} minus {titles.get(r.to, r.to)}"
-        out.append(f"system {pair} ({common} common objects): {told}; {known}")
+        way = "" if r.by == r.to else f" with {titles.get(r.by, r.by)}"
+        out.append(f"system {pair} ({common} common objects{way}): {told}; {known}")
     return out
 
 

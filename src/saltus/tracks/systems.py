@@ -22,8 +22,9 @@ class Registered(NamedTuple):
     """How one system was registered."""
 
     name: str
-    to: str  # the system it was compared with, "" for the reference
+    to: str  # the reference, whose frame the biases are against; "" for the reference
     found: Registration | None  # None for the reference
+    by: str = ""  # the system it was compared with, itself in that frame already
 
 
 def register_all(
@@ -48,7 +49,7 @@ def register_all(
     for k in order[1:]:
         tried = {j: register(systems[k].view, done[j].view, pairing, expected) for j in done}
         best = max(tried, key=lambda j: int(tried[j].series.objects[-1]) if len(tried[j].series.time) else -1)
-        how[k] = Registered(systems[k].name, systems[best].name, tried[best])
+        how[k] = Registered(systems[k].name, systems[order[0]].name, tried[best], systems[best].name)
         done[k] = _moved(systems[k], tried[best])
     return [done[k] for k in range(len(systems))], [how[k] for k in range(len(systems))]
 
