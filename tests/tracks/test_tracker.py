@@ -237,13 +237,16 @@ def test_plots_of_a_late_source_update_the_track_where_the_target_was(rng):
     assert np.abs(found.rows.moments.mean[late][:, 1] - speed).max() < 20.0
 
 
-def test_a_start_from_two_radars_at_nearly_one_time(rng):
-    """Plots 10 ms apart tell no velocity: what is known of speeds must stay known."""
+@pytest.mark.parametrize("late", [0.0, 0.06])
+def test_a_start_from_two_radars_at_nearly_one_time(rng, late):
+    """Plots 10 ms apart tell no velocity: what is known of speeds must stay known, and so must where the target is."""
     n = 12
     time = np.sort(np.concatenate([DT * np.arange(n), DT * np.arange(n) + 0.01]))
     xy = np.column_stack([200.0 * time, np.full(2 * n, 3e4)]) + 50.0 * rng.standard_normal((2 * n, 2))
-    found = run(measured(time, xy, 50.0, source=np.tile([0, 1], n)), periods=(DT, DT))
+    m = replace(measured(time, xy, 50.0, source=np.tile([0, 1], n)), jitter=np.full(2 * n, late))
+    found = run(m, periods=(DT, DT))
     assert len(np.unique(found.track_id)) == 1
+    assert np.sqrt(found.all_rows.moments.cov[:, 0, 0].max()) < 60.0
     speed = np.hypot(*found.all_rows.moments.mean[:, [1, 3]].T)
     assert speed.max() < 1500.0
 

@@ -238,7 +238,8 @@ class Tracker:
         if not len(rows):
             return
         first, dt = life.plot[rows], m.time[plots] - life.time[rows]
-        velocity = (m.position[plots, :2] - m.position[first, :2]) / dt[:, None]
+        way = m.position[plots, :2] - m.position[first, :2]
+        velocity = way / np.maximum(dt, np.linalg.norm(way, axis=-1) / self._settings.max_speed)[:, None]
         (z0, R0), (z1, R1) = m.with_height(first, prior), m.with_height(plots, prior)
         start = two_point_start(z0, R0 + m.stamped(first, velocity), z1, R1 + m.stamped(plots, velocity), dt)
         start = with_speed_prior(start, self._settings.max_speed)
