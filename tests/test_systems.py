@@ -292,3 +292,18 @@ def test_an_altitude_that_nobody_tells_any_more_is_null(tmp_path):
     for column in ("vu", "cov_uu"):
         values = tracks[column].to_numpy(zero_copy_only=False).astype(float)
         np.testing.assert_array_equal(np.isfinite(values), told)
+
+
+def test_a_system_without_tracks_is_no_reference(tmp_path):
+    """Two positions of a third system make no track: the radars are compared with each other as before."""
+    rng = np.random.default_rng(12)
+    start, velocity = flights(6, rng, 200.0)
+    code = "3C000{}".format
+    tables = [reports(rng, name, start, velocity, 200.0, code=code) for name in ("west", "east")]
+    tables.append([r for r in reports(rng, "adsb", start[:1], velocity[:1], 200.0) if r["time"] < EPOCH + 5.0])
+    found = run(tmp_path, tables)
+    assert found.biases["reference"] in {"west", "east"}
+    finest = reports(rng, "adsb", start, velocity, 200.0, code=code)
+    assert run(tmp_path, [*tables[:2], finest]).biases["reference"] == "adsb"
+    coarse = [{**row, "latitude": row["latitude"] + 3e-3 * rng.standard_normal()} for row in finest]
+    assert run(tmp_path, [*tables[:2], coarse]).biases["reference"] == "adsb"  # a radar has a north of its own

@@ -21,7 +21,7 @@ def counted(m, source, share, period):
     for k in range(len(own)):
         near = (np.abs(square - square[k]) <= 1).all(axis=1)
         _, number = np.unique(time[near], return_counts=True)
-        others.append((number * (number - 1)).sum() / number.sum() / share)
+        others.append((number * (number - 1)).sum() / number.sum() / (1.0 if share > 0.5 else share))
         known = near & np.isfinite(layer)
         beside = (np.abs(layer[known] - layer[k]) <= 1).sum() if np.isfinite(layer[k]) else 0
         height.append(beside / max(known.sum(), 1) / (3 * LAYER))
@@ -58,6 +58,15 @@ def test_a_uniform_scene_has_the_flat_density(rng):
     assert near.mean() == pytest.approx(0.05 * n / 100.0 / 1e10, rel=0.1)
 
 
+def test_what_reports_frame_by_frame_has_no_more_others_in_a_scan(rng):
+    """A camera's pictures: 400 targets at one time, every 4 s. The others are 399 and not 2.5 times as many."""
+    place, beat = rng.uniform(-5e3, 5e3, (400, 2)), np.repeat(4.0 * np.arange(20), 400)
+    m = measured(beat, np.tile(place, (20, 1)), 5.0)
+    inner = np.abs(m.position[:, :2]).max(axis=1) < 4e3
+    near = background(m, np.array([4.0])).plane[inner] - 0.1 * m.density(0, 4.0)
+    assert near.mean() == pytest.approx(0.05 * 400 / 1e8, rel=0.15)
+
+
 def test_a_lone_target_is_none_of_its_own_others():
     m = measured(np.arange(100.0), np.zeros((100, 2)), 5.0, altitude=300.0)
     found = background(m, np.array([1.0]))
@@ -66,7 +75,7 @@ def test_a_lone_target_is_none_of_its_own_others():
 
 
 def apron(rng, n=120):
-    """Aircraft parked 1 km apart and 300 km of airspace; one of them misses plots while another begins 200 m off."""
+    """Aircraft parked 300 m apart, 300 km of airspace; one of them misses plots while another begins 200 m off."""
     parked = np.stack(np.meshgrid(np.arange(5) * 300.0, np.arange(4) * 400.0), axis=-1).reshape(-1, 2)
     beat = np.arange(float(n))
     cruising = np.column_stack([-150e3 + 200.0 * beat, np.full(n, 140e3)])
@@ -88,6 +97,17 @@ def test_a_new_target_among_others_is_nobodys_faulty_plot(rng):
     new = found.track_id[label == label.max()]
     assert len(np.unique(new)) == 1 and new[0] > 0
     assert not np.isin(new[0], found.track_id[label != label.max()])
+
+
+def test_faulty_plots_of_a_target_begin_no_track(rng):
+    """Every other plot of a lone target is faulty, at one place: right ones come two periods apart, none is surplus."""
+    beat = np.arange(40.0)
+    xy = np.where((beat % 2 == 1)[:, None] & (beat > 20)[:, None], [60.0, 20.0], [0.0, 0.0])
+    far = np.column_stack([-150e3 + 200.0 * beat, np.full(40, 140e3)])
+    m = measured(np.tile(beat, 2), np.concatenate([xy, far]) + rng.standard_normal((80, 2)), 1.0)
+    found = run(m, periods=(1.0,), identity=False)
+    lone = np.hypot(*m.position[:, :2].T) < 1e3
+    assert len(np.unique(found.track_id[lone])) == 1
 
 
 def test_a_target_beside_a_lone_one_is_more_than_its_faulty_plots(rng):

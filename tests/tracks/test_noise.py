@@ -106,6 +106,20 @@ def test_errors_of_time_stamps_are_found_along_the_course(rng):
     assert exact.time < 0.005
 
 
+@pytest.mark.parametrize(("sigma", "late"), [(10.0, 0.06), (5.0, 0.06), (20.0, 0.1)])
+def test_time_stamps_are_found_where_positions_are_coarse_and_speeds_mixed(rng, sigma, late):
+    """Slow targets err by sigma, fast ones by both: neither may be taken for the outliers of the other."""
+    m, label = stamped(rng, np.linspace(35.0, 240.0, 20), sigma, late)
+    found = estimate_noise(m, label, 0)
+    assert found.xy == pytest.approx(sigma, rel=0.05)
+    assert found.time == pytest.approx(late, rel=0.15)
+
+
+def test_short_tracks_tell_by_shorter_windows(rng):
+    m, label = stamped(rng, np.full(60, 10.0), 0.3, 0.0, n=90, period=0.1)
+    assert estimate_noise(m, label, 0).xy == pytest.approx(0.3, rel=0.05)
+
+
 def test_slow_targets_tell_nothing_of_time_stamps(rng):
     m, label = stamped(rng, np.full(10, 10.0), 2.0, 0.06)
     found = estimate_noise(m, label, 0)

@@ -293,6 +293,15 @@ def test_a_late_time_stamp_is_no_manoeuvre(rng):
     assert np.median(along) == pytest.approx((200.0 * late) ** 2 + 4.0, rel=0.1)
 
 
+def test_an_address_begins_one_track_however_often_it_reports(rng):
+    """Four reports in the time that the period says is one's: the second is no neighbour's, it has the address."""
+    time = np.arange(0.0, 60.0, 1.0)
+    xy = np.column_stack([200.0 * time, np.zeros(60)]) + 10.0 * rng.standard_normal((60, 2))
+    found = run(measured(time, xy, 10.0, icao24=0x3C0001), periods=(4.0,))
+    assert len(np.unique(found.track_id)) == 1 and found.track_id[0] > 0
+    assert found.raw.track_id.max() == 1
+
+
 def test_targets_that_report_in_turn_get_their_own_tracks(rng):
     """Twenty stand within 500 m and report every half second, when they like: most from their own plots alone."""
     n, k, right = 40, 20, []

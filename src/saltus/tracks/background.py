@@ -14,7 +14,7 @@ from jaxtyping import Float
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.slices import shortest
 
-__all__ = ["Background", "background"]
+__all__ = ["Background", "background", "flat"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
@@ -39,8 +39,8 @@ def background(m: Measurements, periods: npt.NDArray[np.float64]) -> Background:
 
     with n the source's plots per scan, A the circle of two deviations of its longer axis, and n(x) the mean number of
     other plots of the same scan in a square of area a, where there is one: sum k (k - 1) / sum k over the numbers k of
-    plots in the square at a time, so that a lone target is none of its own others. Heights are flat in the first term,
-    and have the density of those in the square in the second.
+    plots in the square at a time, so that a lone target is none of its own others. Heights are flat in the first term;
+    in the second they have the density of all in the square, the target's own included.
 
     Args:
         m: all measurements.
@@ -52,20 +52,26 @@ def background(m: Measurements, periods: npt.NDArray[np.float64]) -> Background:
         if not len(own):
             continue
         cell = np.floor(m.position[own, :2] / _CELL).astype(np.int64)
-        flat = _ANYWHERE * m.density(source, period)
+        even = _ANYWHERE * m.density(source, period)
         near = _AMONG * _others(cell, m.time[own], shortest(m, source), period) / (3.0 * _CELL) ** 2
-        plane[own] = flat + near
+        plane[own] = even + near
         known = np.flatnonzero(np.isfinite(m.position[own, 2]))
         layer = np.floor(m.position[own[known], 2] / _LAYER).astype(np.int64)
         share = _around(np.column_stack([cell[known], layer])) / _around(cell[known]) / (3.0 * _LAYER)
-        height[own[known]] = (flat / _HEIGHT_SPAN + near[known] * share) / (flat + near[known])
+        height[own[known]] = (even / _HEIGHT_SPAN + near[known] * share) / (even + near[known])
     return Background(plane, height)
+
+
+def flat(n: int, density: float) -> Background:
+    """Return a density (per m^2 and scan) that is the same at n measurements, with heights as everywhere."""
+    return Background(np.full(n, density), np.full(n, 1.0 / _HEIGHT_SPAN))
 
 
 def _others(cell: _Index, time: _Array, share: float, period: float) -> _Array:
     """Return how many other plots per scan there are in the block of 3 x 3 cells about each plot's, where there is one.
 
-    No target has two plots in a share of the period; what others have in it, they have in every such share.
+    No target has two plots in a share of the period. Where targets report at times of their own, what others have in it
+    they have in every such share; of a radar, or where all report at one time, they have no more in a scan.
     """
     key, step = _keys(cell)
     names, place = np.unique(key, return_inverse=True)
@@ -77,7 +83,8 @@ def _others(cell: _Index, time: _Array, share: float, period: float) -> _Array:
     both, k = np.unique(at[counted] * (number.max() + 1) + when, return_counts=True)
     of = both // (number.max() + 1)
     pairs = np.bincount(of, k * (k - 1.0), len(names)) / np.bincount(of, k, len(names))
-    return np.asarray(pairs[place] / share)
+    in_turn = share < 0.5 < len(np.unique(time)) / len(time)
+    return np.asarray(pairs[place] / (share if in_turn else 1.0))
 
 
 def _around(cell: _Index) -> _Array:

@@ -20,7 +20,7 @@ _Index = npt.NDArray[np.intp]
 
 _POSITION, _VELOCITY = np.array([0, 2, 4]), np.array([1, 3, 5])
 _FAULT_GATE = 0.99
-_SOONEST = 0.75  # of the update period: no target's second plot comes sooner
+_SOONEST = 0.75  # of the update period: what comes sooner after a first plot is taken for a neighbour's
 _LATEST = -2.0  # s: how far a plot may lie before its track's last update
 
 
@@ -195,7 +195,8 @@ class Gate:
         plot, first = index[pairs.plot], life.plot[pairs.track]
         dt = m.time[plot] - life.time[pairs.track]
         soonest = np.where(m.source[plot] == m.source[first], _SOONEST * self._periods[m.source[plot]], 0.0)
-        keep = np.where(life.status[pairs.track] == SEED, (dt > 0.0) & (dt >= soonest), dt > _LATEST)
+        late = (dt >= soonest) | self._same_address(pairs, life, m, index)
+        keep = np.where(life.status[pairs.track] == SEED, (dt > 0.0) & late, dt > _LATEST)
         if self._use_identity:
             keep &= ~conflicting(life.icao24[pairs.track], m.icao24[plot])
             keep &= (life.icao24[pairs.track] >= 0) | ~life.holds(m.icao24[plot])  # an address goes to its own track

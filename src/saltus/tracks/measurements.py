@@ -123,21 +123,28 @@ class Measurements:
         return out
 
     def split_from(
-        self, left: npt.NDArray[np.intp], used: npt.NDArray[np.intp], max_range: float, max_azimuth: float
+        self,
+        left: npt.NDArray[np.intp],
+        used: npt.NDArray[np.intp],
+        speed: _Array,
+        max_range: float,
+        max_azimuth: float,
     ) -> npt.NDArray[np.bool_]:
         """Say which plots left over are second plots of a target seen in the same scan.
 
         What a source resolves goes with its errors: two plots of one target that it measures to a metre differ by the
-        target's length at most.
+        target's length, and by what it flew between them.
 
         Args:
             left: plots without a track, (k,).
             used: plots of the same source and scan that updated a confirmed track, (l,).
+            speed: of those tracks, (l,), m/s.
             max_range: m, also the distance for sources that do not measure range.
             max_azimuth: rad.
         """
         a, b = left[:, None], used[None, :]
-        reach = np.minimum(max_range, _HULL + _RESOLUTION * self._deviation(left)[:, None])
+        flown = speed * np.abs(self.time[a] - self.time[b])
+        reach = np.minimum(max_range, _HULL + _RESOLUTION * self._deviation(left)[:, None] + flown)
         d_range, d_azimuth = np.moveaxis(np.abs(self.polar[a] - self.polar[b]), -1, 0)
         d_azimuth = np.minimum(d_azimuth, 2.0 * np.pi - d_azimuth)
         distance = np.linalg.norm(self.position[a, :2] - self.position[b, :2], axis=-1)
@@ -234,7 +241,9 @@ def place_plots(
         origin=sights[:, :2],
         bearing=sights[:, 2],
         sigma_bearing=sights[:, 3],
-        jitter=np.array([noise[s].time for s in range(len(plots.sources))])[plots.source[usable]],
+        jitter=np.where(
+            np.isnan(ray[:, 0]), np.array([noise[s].time for s in range(len(plots.sources))])[plots.source[usable]], 0.0
+        ),
         inflation=np.array([noise[s].inflation for s in range(len(plots.sources))])[plots.source[usable]],
     )
 

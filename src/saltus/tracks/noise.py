@@ -21,6 +21,7 @@ _MOVING = 3.0  # m/s
 _MAX_GAP = 2.5  # of the median interval: no window spans a longer gap
 _MIN_WINDOWS = 30  # fewer say nothing
 _TRIM = 4.0
+_ROUNDS = 4
 _SHARE, _CHI2_QUANTILE = 0.8, 3.2189  # of the chi-square law of two degrees of freedom
 _MAD = 1.4826  # normal standard deviation per median absolute deviation
 
@@ -38,11 +39,12 @@ class NoiseEstimate(NamedTuple):
 def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int) -> NoiseEstimate:
     """Estimate one source's noise from the scatter of its plots about local quadratics in time.
 
-    For seven plots of one track, two seconds apart or more, a quadratic x(t), y(t) is fitted by least squares; the
-    residual e of the middle plot has variance sigma^2 (1 - h), h its leverage, whatever constant acceleration the
-    target has. Along and across the ray from the radar, sigma is the root mean square of e / sqrt(1 - h) over all
-    straight windows, those beyond four median deviations (outliers, turns) left out. Of positions, sigma is found
-    across the course, and from what is more along it the deviation of time stamps: of e / speed less sigma / speed.
+    For seven plots of one track, of positions some two seconds apart, a quadratic x(t), y(t) is fitted by least
+    squares; the residual e of the middle plot has variance sigma^2 (1 - h), h its leverage, whatever constant
+    acceleration the target has. Along and across the ray from the radar, sigma is the root mean square of
+    e / sqrt(1 - h) over all straight windows, those beyond four median deviations (outliers, turns) left out. Of
+    positions, sigma is found across the course, and from what is more along it the deviation of time stamps tau:
+    mean e^2 = sigma^2 + tau^2 v^2.
 
     Args:
         m: measurements in time order.
@@ -52,11 +54,24 @@ def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int
     index = np.flatnonzero((m.source == source) & (track_id > 0))
     index = index[np.lexsort((m.time[index], track_id[index]))]
     step = np.diff(m.time[index])[np.diff(track_id[index]) == 0]
-    every = max(1, round(_STEP / float(np.median(step[step > 0])))) if (step > 0).any() else 1
-    whole = (_WINDOW - 1) * every + 1
-    if len(index) < whole:
+    every = 1
+    if (step > 0).any() and np.isnan(m.ray[index, 0]).any():
+        every = max(1, round(_STEP / float(np.median(step[step > 0]))))
+    for each in dict.fromkeys((every, 1)):  # tracks too short for windows of that length tell by shorter ones
+        found = _estimated(m, track_id, index, each)
+        if found.n_windows >= _MIN_WINDOWS:
+            return found
+    return found
+
+
+def _estimated(
+    m: Measurements, track_id: npt.NDArray[np.int64], index: npt.NDArray[np.intp], every: int
+) -> NoiseEstimate:
+    """Estimate from windows of every so many plots; `index` is sorted by track, then by time."""
+    length = (_WINDOW - 1) * every + 1
+    if len(index) < length:
         return NoiseEstimate(np.nan, np.nan, np.nan, np.nan, 0)
-    window = np.lib.stride_tricks.sliding_window_view(index, whole)[:, ::every]
+    window = np.lib.stride_tricks.sliding_window_view(index, length)[:, ::every]
     time = m.time[window] - m.time[window[:, _WINDOW // 2]][:, None]
     step = np.diff(m.time[window], axis=1)
     whole = (track_id[window] == track_id[window[:, :1]]).all(axis=1) & (step > 0).all(axis=1)
@@ -106,8 +121,13 @@ def _of_positions(residual: _Array, velocity: _Array) -> tuple[float, float]:
     moving = speed > _MOVING
     u = velocity[moving] / speed[moving, None]
     xy = _trimmed(residual[moving, 1] * u[:, 0] - residual[moving, 0] * u[:, 1])
-    late = (residual[fast] * velocity[fast]).sum(axis=-1) / speed[fast] ** 2
-    return xy, float(np.sqrt(max(0.0, _trimmed(late) ** 2 - xy**2 * np.mean(speed[fast] ** -2.0))))
+    along, v = (residual[fast] * velocity[fast]).sum(axis=-1) / speed[fast], speed[fast]
+    late = 0.0
+    for _ in range(_ROUNDS):  # what is an outlier depends on it
+        e = np.abs(along) / np.sqrt(np.maximum(xy**2 + (late * v) ** 2, 1e-12))
+        inside = e <= _TRIM * _MAD * np.median(e)
+        late = float(np.sqrt(max(0.0, np.mean(along[inside] ** 2) - xy**2) / np.mean(v[inside] ** 2)))
+    return xy, late
 
 
 def _trimmed(e: _Array) -> float:

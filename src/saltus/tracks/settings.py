@@ -80,8 +80,8 @@ class TrackerSettings:
         gate_probability: probability that a target's own plot falls inside its gate.
         detection_probability: probability that a target gives a plot in a scan.
         clutter_density: false plots and new targets per m^2 and scan; a higher value makes the tracker prefer
-            leaving a distant plot alone to stretching a track. Absent: a tenth of the density of the source's plots,
-            half of it that around the plot, half that over all the source covers.
+            leaving a distant plot alone to stretching a track. Absent: a tenth of the density of the source's plots
+            over all it covers, and a twentieth of that of the other plots around.
         clutter_density_azimuth: false bearings and other objects per radian and scan, of sources that give bearings
             alone.
         max_speed: fastest target, m/s: no track starts faster, and one that becomes so is dropped.
@@ -92,7 +92,7 @@ class TrackerSettings:
         coast_seconds: shortest time a confirmed track coasts before it is dropped, s.
         split_range: a plot left over within this range (m) and `split_azimuth` (degrees) of a plot of the same
             source and scan that updated a confirmed track, with no other height or identity, is a split plot. The
-            range is 75 m and 15 standard deviations of the plot, if that is less.
+            range is 75 m, 15 standard deviations of the plot and the way flown in between, if that is less.
         split_azimuth: see split_range.
         altitude_outlier: probability that a plot's height is wrong (garbled Mode C); such a height is ignored.
         plot_outlier: probability that a radar plot's azimuth is faulty, and its range, or the position of another

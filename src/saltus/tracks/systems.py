@@ -54,9 +54,9 @@ def register_all(
     return [done[k] for k in range(len(systems))], [how[k] for k in range(len(systems))]
 
 
-def _trust(system: LocalSystem) -> tuple[bool, float]:
-    """Rank systems, the most trusted first: a radar has a north of its own, of others the finest goes first."""
-    return bool(np.isfinite(system.view.ray).any()), system.noise
+def _trust(system: LocalSystem) -> tuple[bool, bool, float]:
+    """Rank systems, the most trusted first: one without tracks knows nothing, a radar has a north of its own."""
+    return not len(system.ids), bool(np.isfinite(system.view.ray).any()), system.noise
 
 
 def _moved(system: LocalSystem, found: Registration) -> LocalSystem:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
-from saltus.tracks.background import Background, background
+from saltus.tracks.background import Background, background, flat
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
@@ -82,6 +82,7 @@ class Tracker:
         self._track_id = np.zeros(len(measurements), np.int64)
         self._split = np.zeros(len(measurements), bool)
         self._elsewhere = np.zeros(len(measurements), bool)
+        self._speed = np.zeros(len(measurements))  # of the track after each plot that it took, m/s
         self._background = self._densities(measurements)
         self._sources = [self._condition(s) for s in range(len(self._periods))]
         for begin, end in slices(measurements, self._periods):
@@ -105,9 +106,8 @@ class Tracker:
 
     def _densities(self, m: Measurements) -> Background:
         """Clutter and new targets at each measurement."""
-        found = background(m, self._periods)
         given = self._settings.clutter_density
-        return found if given is None else found._replace(plane=np.full(len(m), given))
+        return background(m, self._periods) if given is None else flat(len(m), given)
 
     def _housekeep(self, now: float) -> None:
         """Publish what coasts; drop what is overdue or moves as no target does."""
@@ -157,6 +157,7 @@ class Tracker:
         left = np.ones(len(index), bool)
         left[gated.pairs.plot[chosen]] = False
         used = plots[life.status[rows] == CONFIRMED]
+        self._speed[plots] = np.hypot(life.mean[rows, 1], life.mean[rows, 3])
         self._begin(index[left], used, wait)
         far = np.linalg.norm(m.position[plots, :2] - gated.centre[chosen], axis=-1) > self._settings.split_range
         self._also_begin(plots[~new & (wrong > 0.5) & far], used, wait)
@@ -296,7 +297,8 @@ class Tracker:
 
     def _split_from(self, plots: _Index, used: _Index) -> npt.NDArray[np.bool_]:
         settings = self._settings
-        return self._m.split_from(plots, used, settings.split_range, np.radians(settings.split_azimuth))
+        reach = settings.split_range, np.radians(settings.split_azimuth)
+        return self._m.split_from(plots, used, self._speed[used], *reach)
 
     def _seed(self, plots: _Index, wait: float) -> _Index:
         """Begin a track with every plot."""
