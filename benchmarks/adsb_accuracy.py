@@ -5,7 +5,7 @@
 RECORDING holds CAT021 reports of one source; REFERENCE is a Parquet table of the same reports with what they say of
 their velocity and the tracker does not use: `time` (UTC s), `icao24`, `gs_kt`, `track_deg`, and `pa`, the position's
 accuracy category, of which 5 and better are taken. Tracked with default settings, and once more with exact time stamps
-(`sigma_time = 0`). Prints one table.
+(`sigma_time = 0`, in a table of its own: sensors.toml must not name the source). Prints one table.
 """
 
 import argparse

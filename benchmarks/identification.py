@@ -303,7 +303,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("barcelona", type=Path)
     parser.add_argument("argentina", type=Path)
-    parser.add_argument("-o", "--output", type=Path, default=Path("identification.json"))
+    parser.add_argument("-o", "--output", type=Path, default=Path(__file__).with_name("results_identification.json"))
     args = parser.parse_args()
     began = time.perf_counter()
     parts = {

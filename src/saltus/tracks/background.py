@@ -12,7 +12,7 @@ import numpy.typing as npt
 from jaxtyping import Float
 
 from saltus.tracks.measurements import Measurements
-from saltus.tracks.slices import shortest
+from saltus.tracks.slices import shortest_share
 
 __all__ = ["Background", "background", "flat"]
 
@@ -53,7 +53,7 @@ def background(m: Measurements, periods: npt.NDArray[np.float64]) -> Background:
             continue
         cell = np.floor(m.position[own, :2] / _CELL).astype(np.int64)
         even = _ANYWHERE * m.density(source, period)
-        near = _AMONG * _others(cell, m.time[own], shortest(m, source), period) / (3.0 * _CELL) ** 2
+        near = _AMONG * _others(cell, m.time[own], shortest_share(m, source), period) / (3.0 * _CELL) ** 2
         plane[own] = even + near
         known = np.flatnonzero(np.isfinite(m.position[own, 2]))
         layer = np.floor(m.position[own[known], 2] / _LAYER).astype(np.int64)

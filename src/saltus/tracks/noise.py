@@ -14,7 +14,7 @@ __all__ = ["NoiseEstimate", "apply_estimate", "estimate_noise", "widened"]
 _Array = npt.NDArray[np.float64]
 
 _WINDOW = 7  # plots of one track
-_STEP = 2.0  # s between them, or more: in less, what an aircraft's position errs by looks like a turn
+_STEP = 2.0  # s, some, between those of a position: in less, what an aircraft's position errs by looks like a turn
 _FAST = 30.0  # m/s, from which errors of the time stamp show
 _MAX_ACCEL = 1.0  # m/s^2 over the window: straighter than any turn of an aircraft
 _MOVING = 3.0  # m/s

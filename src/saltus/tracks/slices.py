@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from saltus.tracks.measurements import Measurements
 
-__all__ = ["rounds", "shortest", "slices"]
+__all__ = ["rounds", "shortest_share", "slices"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -19,7 +19,7 @@ _LONGEST = 4.0  # s
 _DEVIATIONS = 4.0  # of two plots of one target
 
 
-def shortest(m: Measurements, source: int) -> float:
+def shortest_share(m: Measurements, source: int) -> float:
     """Return the share of its period within which a target gives a source at most one plot."""
     own = np.flatnonzero(m.source == source)
     return _ROTATING if len(own) and np.isfinite(m.ray[own[0], 0]) else _OTHER
