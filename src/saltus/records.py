@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-__all__ = ["REASONS", "Contents", "Kind", "Plots", "Recording", "Source", "System"]
+__all__ = ["REASONS", "Contents", "Kind", "Plots", "Recording", "Source", "System", "Traits"]
 
 # Why a report is not used. Index 0 means usable; readers set the codes below, trackers never change them.
 REASONS = (
@@ -65,16 +65,42 @@ class System:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
-    """One system as it occurs in the inputs, with the quantisation of its reports.
+class Traits:
+    """What a source is, told by its reader; nobody else asks in which format its reports came.
 
-    Quantisation steps (one least significant bit): `range_lsb`, `xy_lsb`, `altitude_lsb` in m, `azimuth_lsb` in
-    rad, `time_lsb` in s; 0 where the format does not quantise.
+    Attributes:
+        rotating: a beam goes round, and looks at each target once in an update period.
+        self_reporting: targets tell where they are, each by its own means and at times of its own.
+        surface: sees what stands on the ground.
+        pooled: makes common local tracks with the other sources of this trait, unless the configuration says otherwise.
+        rest_period: s between two reports of a target at rest; 0 = no longer than of one that moves.
+        sigma_time: standard deviation of time stamps, s, where nothing better is known.
+        latency: s from the time of a report until it is received.
+    """
+
+    rotating: bool = False
+    self_reporting: bool = False
+    surface: bool = False
+    pooled: bool = False
+    rest_period: float = 0.0
+    sigma_time: float = 0.0
+    latency: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One system as it occurs in the inputs: what it is, and the quantisation of its reports.
+
+    Quantisation steps (one least significant bit): `range_lsb`, `xy_lsb`, `altitude_lsb` in m, `azimuth_lsb` and
+    `elevation_lsb` in rad, `range_rate_lsb` in m/s, `time_lsb` in s; 0 where the format does not quantise.
     """
 
     system: System
+    traits: Traits = Traits()
     range_lsb: float = 0.0
     azimuth_lsb: float = 0.0
+    elevation_lsb: float = 0.0
+    range_rate_lsb: float = 0.0
     xy_lsb: float = 0.0
     altitude_lsb: float = 0.0
     time_lsb: float = 0.0

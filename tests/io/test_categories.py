@@ -9,7 +9,7 @@ from frames import NORTH, PLOT, plot
 from saltus.errors import DataError
 from saltus.io import read
 from saltus.io.asterix_write import write_cat048
-from saltus.records import REASONS, Kind
+from saltus.records import REASONS, Kind, Traits
 
 DAY = datetime.date(2024, 5, 1)
 MIDNIGHT = datetime.datetime(2024, 5, 1, tzinfo=datetime.UTC).timestamp()
@@ -42,6 +42,7 @@ def test_radar_plot(tmp_path):
     source = p.sources[p.source[0]]
     assert (source.range_lsb, source.time_lsb) == (1852 / 256, 1 / 128)
     assert str(source.system) == "CAT048:20/129"
+    assert source.traits == Traits(rotating=True)
     assert got.problems == ()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from saltus.errors import DataError
 from saltus.io import read
-from saltus.records import REASONS, Kind
+from saltus.records import REASONS, Kind, Traits
 
 NOON = datetime.datetime(2024, 5, 1, 12, tzinfo=datetime.UTC).timestamp()
 
@@ -45,6 +45,14 @@ def test_polar_csv(tmp_path):
     assert [s.system.name for s in p.sources] == ["A", "B"]
     assert got.problems == ()
     assert [c.n_reports for c in got.contents] == [1, 1]
+
+
+def test_a_source_that_measures_range_turns_round(tmp_path):
+    got = csv(tmp_path, "time,range_m,azimuth_deg,source\n1,1000,90,radar\n1,,90,camera\n")
+    assert [(s.system.name, s.traits) for s in got.plots.sources] == [
+        ("camera", Traits(pooled=True)),
+        ("radar", Traits(pooled=True, rotating=True)),
+    ]
 
 
 def test_each_row_takes_the_position_it_has(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 from saltus.config import SensorConfig
 from saltus.errors import DataError
 from saltus.geo import Plane, Site
+from saltus.io.assemble import CATEGORIES
 from saltus.records import Kind, Plots, Source, System
 from saltus.run.command import _noise
 from saltus.tracks.measurements import Noise, default_noise, make_plane, place_plots
@@ -119,7 +120,9 @@ def test_a_position_whose_noise_is_configured_has_exact_times_unless_told(told, 
 
 @pytest.mark.parametrize(("category", "time"), [(21, 0.2 / np.sqrt(12.0)), (10, 0.0)])
 def test_transponders_send_positions_a_little_off_their_time(sea, category, time):
-    assert default_noise(Source(System(category, 1, 1))).time == time
+    assert default_noise(Source(System(1, 1, 1), CATEGORIES[category].traits)).time == time
+    coarse = Source(System(1, 1, 1), CATEGORIES[category].traits, time_lsb=1.0)
+    assert default_noise(coarse).time == pytest.approx(1.0 / np.sqrt(12.0))  # the clock's step
     ship, (x, y, _), _ = sea
     noise = {0: Noise(time=0.3)}
     m = place_plots(reports(ship, Kind.PLANE, x=x, y=y), Plane(1.1, 0.18), [None], noise, (0.0, 30.0))

@@ -18,8 +18,8 @@ from saltus.io.cat062 import CAT062
 from saltus.io.clock import DAY, day_offsets
 from saltus.io.columns import Category, Columns, Decoded
 from saltus.io.layout import Layout, Malformed
-from saltus.io.part import Part, revisit
-from saltus.records import Contents, Plots, Source, System
+from saltus.io.part import Part, revisit, rotating
+from saltus.records import Contents, Kind, Plots, Source, System, Traits
 
 __all__ = ["CATEGORIES", "TIME_ITEM", "Records", "assemble"]
 
@@ -81,7 +81,11 @@ def assemble(
     turns = _turns(walked, decoded, times)
     for number, r in walked.items():
         systems, system_of = _systems(number, r.columns())
-        sources = tuple(Source(s, **decoded[number].steps) for s in systems)
+        traits = CATEGORIES[number].traits if number in CATEGORIES else Traits()
+        kinds = np.asarray(decoded[number].columns.get("kind", np.full(len(system_of), Kind.NONE)))
+        sources = tuple(
+            Source(s, rotating(traits, kinds[system_of == k]), **decoded[number].steps) for k, s in enumerate(systems)
+        )
         part = _plots(name, sources, system_of, times[number], decoded[number])
         plots.append(part)
         table = decoded[number].tracks

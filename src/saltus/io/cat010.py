@@ -23,7 +23,7 @@ that the station's tracking computes (161, 170, 200, 202, 210).
 import numpy as np
 
 from saltus.io.columns import Category, Columns, Decoded, first_reason, validated
-from saltus.records import Kind
+from saltus.records import Kind, Traits
 
 __all__ = ["CAT010"]
 
@@ -80,4 +80,4 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT010 = Category(10, _ITEMS, _decode)
+CAT010 = Category(10, _ITEMS, _decode, traits=Traits(surface=True))

@@ -19,7 +19,7 @@ Geometric height (140) is no pressure altitude and is counted only, like velocit
 import numpy as np
 
 from saltus.io.columns import Category, Columns, Decoded, first_reason
-from saltus.records import Kind
+from saltus.records import Kind, Traits
 
 __all__ = ["CAT021"]
 
@@ -94,4 +94,12 @@ def _plausible(c: Columns) -> float:
     return float(share)
 
 
-CAT021 = Category(21, _ITEMS, _decode, _plausible)
+# A transponder at rest on the ground tells its position every 5 s; one without a clock of its own sends a position up
+# to 0.1 s off the time it is received at.
+CAT021 = Category(
+    21,
+    _ITEMS,
+    _decode,
+    _plausible,
+    Traits(self_reporting=True, rest_period=5.0, sigma_time=0.2 / 12.0**0.5),
+)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from saltus.io.layout import Layout
-from saltus.records import REASONS
+from saltus.records import REASONS, Traits
 
 __all__ = ["Category", "Columns", "Decoded", "first_reason", "icao_text", "validated"]
 
@@ -37,13 +37,15 @@ class Category:
     """What to take from the records of one category, and how to read it.
 
     `items` are kept as bytes while the file is walked; `decode` turns them into arrays. `plausible` says how well
-    the numbers hang together (0 to 1): it decides between editions whose definitions both parse.
+    the numbers hang together (0 to 1): it decides between editions whose definitions both parse. `traits` are those
+    of every source of the category; that one rotates is told by its reports.
     """
 
     number: int
     items: tuple[str, ...]
     decode: Callable[["Columns"], Decoded]
     plausible: Callable[["Columns"], float] | None = None
+    traits: Traits = Traits()
 
 
 class Columns:

@@ -1,5 +1,6 @@
 """What a reader makes of one file, before files are merged."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -7,9 +8,9 @@ import numpy.typing as npt
 import pyarrow as pa
 from jaxtyping import Int
 
-from saltus.records import Contents, Plots
+from saltus.records import Contents, Kind, Plots, Traits
 
-__all__ = ["Part", "revisit", "scan_period"]
+__all__ = ["Part", "revisit", "rotating", "scan_period"]
 
 _FEW = 5  # intervals that make a median
 _NEARLY, _MOSTLY = 0.2, 0.8  # this share of the intervals lies within that of their median: one report a scan
@@ -26,6 +27,11 @@ class Part(NamedTuple):
     problems: tuple[str, ...]
     in_order: bool  # the order of the reports is the order of reception (not so in tables)
     dated: bool  # the file tells the date itself
+
+
+def rotating(traits: Traits, kind: npt.NDArray[np.integer]) -> Traits:
+    """Return the traits of a source with reports of these kinds: what measures range and azimuth turns round."""
+    return replace(traits, rotating=bool((kind == Kind.POLAR).any()))
 
 
 def revisit(time: npt.ArrayLike, *identities: Int[np.ndarray, " n"]) -> float:

@@ -40,8 +40,8 @@ from saltus.errors import DataError
 from saltus.io.cells import codes, numbers, tell, times, truths
 from saltus.io.merge import LIMITS
 from saltus.io.observer import FRAME, observer_columns
-from saltus.io.part import Part, revisit, scan_period
-from saltus.records import REASONS, Contents, Kind, Plots, Source, System
+from saltus.io.part import Part, revisit, rotating, scan_period
+from saltus.records import REASONS, Contents, Kind, Plots, Source, System, Traits
 
 __all__ = ["csv_as_text", "read_csv", "read_parquet"]
 
@@ -306,7 +306,9 @@ def _part(path: Path, table: pa.Table, columns: dict[str, npt.ArrayLike], proble
     systems = [System(None, None, None, label) for label in sorted(set(labels))]
     position = {s.name: k for k, s in enumerate(systems)}
     columns |= {"source": [position[label] for label in labels], "file": np.zeros(n)}
-    plots = Plots.build(n, tuple(Source(s) for s in systems), (path.name,), columns)
+    kind, source = np.asarray(columns["kind"]), np.asarray(columns["source"])
+    sources = tuple(Source(s, rotating(Traits(pooled=True), kind[source == k])) for k, s in enumerate(systems))
+    plots = Plots.build(n, sources, (path.name,), columns)
     unused = [c for c in table.column_names if c not in _COLUMNS]
     notes = (f"columns not used: {', '.join(unused)}",) if unused else ()
     of_system = [np.flatnonzero(plots.source == k) for k in range(len(systems))]

@@ -38,7 +38,6 @@ __all__ = ["parse_time", "track_files", "track_recording", "write_tracks"]
 
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 _DAY = 86400.0  # s
-_ADSB, _PARKED = 21, 5.0  # s: category, and how seldom a transponder at rest on the ground tells its position
 _REPORT = "report.html"
 _MANY = 100  # positions of a source that should have made a track
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
@@ -281,7 +280,7 @@ def _sensors(sources: Sequence[Source], recording: Recording, config: Config) ->
         given = None if sensor is None else sensor.period
         told_periods.append(given or (float(np.median(told)) if told else np.nan))
         periods.append(_NO_PERIOD if np.isnan(told_periods[-1]) else told_periods[-1])
-        waits.append(max(periods[-1], _PARKED if source.system.category == _ADSB else 0.0))
+        waits.append(max(periods[-1], source.traits.rest_period))
         configured.append({} if sensor is None else _noise(sensor, periods[-1]))
         names.append(sensor.name if sensor is not None and sensor.name else str(source.system))
         told_systems.append("" if sensor is None else sensor.system)

@@ -80,8 +80,8 @@ def track_plots(
 def _parties(plots: Plots, sensors: Sensors) -> list[Party]:
     """Return the systems that have usable reports."""
     used = np.unique(plots.source[plots.reason == 0])
-    systems = [s.system for s in plots.sources]
-    found = group_sources([str(s) for s in systems], [s.category for s in systems], sensors.told_systems)
+    names, pooled = [str(s.system) for s in plots.sources], [s.traits.pooled for s in plots.sources]
+    found = group_sources(names, pooled, sensors.told_systems)
     return [party for party in found if np.isin(party.sources, used).any()]
 
 

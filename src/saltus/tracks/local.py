@@ -50,19 +50,19 @@ class Party(NamedTuple):
     sources: tuple[int, ...]
 
 
-def group_sources(names: Sequence[str], categories: Sequence[int | None], told: Sequence[str]) -> list[Party]:
+def group_sources(names: Sequence[str], pooled: Sequence[bool], told: Sequence[str]) -> list[Party]:
     """Return the systems: each ASTERIX source one, all sources of tables together, unless the configuration says.
 
     Args:
         names: designation of each source, `CAT048:20/129` or the name for tables.
-        categories: ASTERIX category of each, None for tables.
+        pooled: whether each makes common local tracks with others (`Traits.pooled`).
         told: system of each as configured, "" where it is not.
     """
     groups: dict[str, list[int]] = {}
-    tables = [s for s, c in enumerate(categories) if c is None and not told[s]]
+    tables = [s for s, common in enumerate(pooled) if common and not told[s]]
     shared = names[tables[0]] if len(tables) == 1 else "table"
     for s, name in enumerate(names):
-        groups.setdefault(told[s] or (shared if categories[s] is None else name), []).append(s)
+        groups.setdefault(told[s] or (shared if pooled[s] else name), []).append(s)
     return [Party(name, tuple(sources)) for name, sources in groups.items()]
 
 

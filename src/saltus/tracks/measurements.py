@@ -31,9 +31,7 @@ _Array = npt.NDArray[np.float64]
 # Where nothing is configured and nothing could be estimated: a monopulse secondary radar, an airport
 # multilateration, ADS-B with good satellite navigation, heights in steps of 100 ft.
 _RANGE, _AZIMUTH, _ELEVATION, _XY, _ALTITUDE = 50.0, np.radians(0.08), np.radians(0.3), 20.0, 10.0
-_SURFACE, _GROUND_RELIEF = 10, 20.0  # ASTERIX category of surface movement; m
-# A transponder without a clock of its own sends a position up to 0.1 s off the time it is received at.
-_ADSB, _STAMP = 21, 0.2 / np.sqrt(12.0)  # ASTERIX category; s
+_GROUND_RELIEF = 20.0  # m
 _SMALLEST_AREA = 1e6  # m^2
 _HULL, _RESOLUTION = 75.0, 15.0  # m, and in standard deviations: how far two plots of one target differ
 _SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
@@ -66,7 +64,7 @@ def default_noise(source: Source) -> Noise:
         azimuth=float(max(_AZIMUTH, source.azimuth_lsb / step)),
         xy=max(_XY, source.xy_lsb / step),
         altitude=max(_ALTITUDE, source.altitude_lsb / step),
-        time=_STAMP if source.system.category == _ADSB else 0.0,
+        time=max(source.traits.sigma_time, source.time_lsb / step),
     )
 
 
@@ -256,8 +254,8 @@ def _site(plots: Plots, site: Site | None) -> Site | Sites | None:
 
 
 def _height_prior(source: Source, site: Site | None, height_prior: tuple[float, float]) -> tuple[float, float]:
-    """Heights that reports do not tell: what a surface movement sensor (CAT010) sees stands on the ground."""
-    if source.system.category == _SURFACE and site is not None:
+    """Heights that reports do not tell: what a surface movement sensor sees stands on the ground."""
+    if source.traits.surface and site is not None:
         return site.height, _GROUND_RELIEF
     return height_prior
 
