@@ -31,6 +31,7 @@ WORDS = {
     "geo": "the ellipsoid",
     "linalg": "small matrix algebra",
     "progress": "a bar",
+    "compiled": "the compiled twins, where built",
     "errors": "ModelError, DataError, NumericalError",
 }
 _COLOURS = (

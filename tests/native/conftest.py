@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from saltus.filters.backend import native_module
+from saltus.compiled import native_module
 
 ISAS = [] if native_module() is None else native_module().instruction_sets()
 

@@ -1,16 +1,15 @@
 """The choice between the definition in NumPy and its compiled twin, and what this machine offers."""
 
-import logging
 import os
 from collections.abc import Sequence
 from functools import cache
 from math import prod
-from types import ModuleType
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
+from saltus.compiled import native_module
 from saltus.errors import ModelError
 
 __all__ = [
@@ -20,7 +19,6 @@ __all__ = [
     "check_settings",
     "fits_kernel",
     "instruction_set",
-    "native_module",
     "system_report",
     "thread_count",
     "use_native",
@@ -30,22 +28,6 @@ Backend = Literal["numpy", "native"]
 
 MOST_STATES, MOST_MODES = 256, 65536  # limits of the compiled kernel; states, and measured components
 _THREAD_WORK = 2e7  # multiply-adds below which starting a thread costs more than it saves
-
-
-@cache
-def native_module() -> ModuleType | None:
-    """Return the compiled kernel, or None where it was not built (said once in the log)."""
-    try:
-        from saltus import _native
-    except ImportError as error:
-        if os.environ.get("SALTUS_REQUIRE_NATIVE") == "1":
-            raise ImportError(
-                "SALTUS_REQUIRE_NATIVE=1, but saltus was installed without its compiled kernel "
-                f"({error}). Install a C++20 compiler and reinstall saltus."
-            ) from error
-        logging.getLogger("saltus").warning("the compiled kernel is absent (%s): filters run in NumPy", error)
-        return None
-    return _native
 
 
 def use_native(backend: Backend | None) -> bool:

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from saltus.compiled import native_module
 from saltus.errors import ModelError, NumericalError
 from saltus.filters.align import Aligned
-from saltus.filters.backend import instruction_set, native_module, thread_count
+from saltus.filters.backend import instruction_set, thread_count
 from saltus.filters.estimates import Estimates
 from saltus.filters.particles import Merged, Tables
 from saltus.filters.steps import NOT_POSITIVE, Belief
