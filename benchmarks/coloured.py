@@ -20,11 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
+from saltus.evaluate import nees
 from saltus.filters import IMM, imm_filter
 from saltus.filters.coloured import run_augmented, run_differenced
 from saltus.filters.coloured_model import augment
 from saltus.linalg import block_diagonal
-from saltus.metrics import nees
 from saltus.models import (
     ColouredSensor,
     Gaussian,

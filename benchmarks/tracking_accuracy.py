@@ -31,13 +31,11 @@ import pyarrow.parquet as pq
 
 from saltus import io
 from saltus.config import load_config
-from saltus.metrics import track_scores
+from saltus.evaluate import track_scores
+from saltus.evaluate.plots import KNOT, downlinked, followed
 from saltus.records import Plots
 
-_KNOT = 1852.0 / 3600.0
-_STEPS = (1 / 128, 1852 / 256, 2 * np.pi / 65536)  # s, m, rad: quantisation of CAT048 time, range, azimuth
 _MIN_PLOTS, _MIN_TRACK, _MIN_SPEED = 10, 5, 100.0  # airborne plots of an aircraft, plots of a track, kt
-_STRAIGHT, _TURN = 3.0, 10.0  # degrees of roll
 _REPLICATES = 400
 
 _STATISTICS: dict[str, Callable[[npt.NDArray[np.float64]], float]] = {
@@ -96,40 +94,12 @@ def track(recording: Path, config: Path, identity: str) -> Run:
     own = {key: k for k, key in enumerate(pairs(assigned, "category", "record"))}
     categories = [s.system.category for s in plots.sources]
     at = [own[categories[s], r] for s, r in zip(plots.source.tolist(), plots.record.tolist(), strict=True)]
-    number = assigned["track_id"].fill_null(-1).to_numpy()[at]
-    updated = rows.filter(np.array(rows["status"].to_pylist()) != "coasted")
-    row = {key: k for k, key in enumerate(pairs(updated, "track_id", "time"))}
-    of_plot = np.array([row.get(key, -1) for key in zip(number.tolist(), plots.time.tolist(), strict=True)])
-
-    def column(name: str) -> Array:
-        return np.where(of_plot >= 0, updated[name].to_numpy()[of_plot], np.nan)
-
-    return Run(plots, number, column("course_deg"), column("speed_mps"), seconds, memory)
+    found = followed(plots, rows, assigned.take(at))
+    return Run(plots, np.where(found.track > 0, found.track, -1), found.course, found.speed, seconds, memory)
 
 
 def pairs(table: pa.Table, first: str, second: str) -> list[tuple[object, ...]]:
     return list(zip(table[first].to_pylist(), table[second].to_pylist(), strict=True))
-
-
-def downlinked(plots: Plots, reference: Path) -> tuple[Array, Array, Array]:
-    """Track angle and roll (degrees) and ground speed (m/s) of each report; NaN where not told."""
-    table = pq.read_table(reference)
-    names = ("time", "rho_nm", "theta_deg", "bds50_track_deg", "bds50_roll_deg", "bds50_gs_kt")
-    t, rho, theta, course, roll, knots = (np.asarray(table[n].to_numpy(), np.float64) for n in names)
-    theirs = keys(t, rho * 1852.0, np.radians(theta))
-    row = {key: k for k, key in enumerate(theirs)}
-    at = np.array([row.get(key, -1) for key in keys(plots.time, plots.range, plots.azimuth)])
-    if np.mean(at >= 0) < 0.99:
-        raise SystemExit(f"{reference}: only {np.mean(at >= 0):.1%} of the recording's reports are in this table.")
-    course, roll, speed = (np.where(at >= 0, values[at], np.nan) for values in (course, roll, knots * _KNOT))
-    return course, roll, speed
-
-
-def keys(t: Array, slant: Array, azimuth: Array) -> list[tuple[int, ...]]:
-    """What tells reports apart in both decodings: raw time of day, range and azimuth."""
-    raw = [np.rint(v / step).astype(np.int64) for v, step in zip((t % 86400.0, slant, azimuth), _STEPS, strict=True)]
-    raw[2] %= 65536
-    return list(zip(*(r.tolist() for r in raw), strict=True))
 
 
 def estimate(
@@ -195,14 +165,14 @@ def majority(track: Index, label: Index) -> Index:
 
 def motion(run: Run, reference: Path) -> list[Figure]:
     """Errors of course and ground speed against the aircraft's own, in straight flight and in turns."""
-    course, roll, speed = downlinked(run.plots, reference)
+    truth = downlinked(run.plots, reference)
     numbers, counts = np.unique(run.track[run.track >= 0], return_counts=True)
     long = np.isin(run.track, numbers[counts >= _MIN_TRACK])
-    good = long & np.isfinite(course + roll + speed + run.course) & (speed > _MIN_SPEED * _KNOT)
-    off = np.abs((run.course - course + 180.0) % 360.0 - 180.0)
-    slow = np.abs(run.speed - speed) / _KNOT
+    good = long & np.isfinite(truth.course + truth.speed + run.course) & (truth.speed > _MIN_SPEED * KNOT)
+    off = np.abs((run.course - truth.course + 180.0) % 360.0 - 180.0)
+    slow = np.abs(run.speed - truth.speed) / KNOT
     figures = []
-    for where, stretch in (("straight", np.abs(roll) < _STRAIGHT), ("turning", np.abs(roll) > _TURN)):
+    for where, stretch in (("straight", truth.straight), ("turning", truth.turning)):
         mine = good & stretch
         aircraft = np.unique(run.plots.icao24[mine])
         for name, error, unit in (("course error", off, "degrees"), ("ground-speed error", slow, "kt")):

@@ -18,7 +18,7 @@ WORDS = {
     "config": "the TOML configuration",
     "studies": "experiments that measure the filters",
     "montecarlo": "seeded runs, in order and reproducible",
-    "metrics": "RMSE, NEES, NIS, OSPA, GOSPA, scores of tracks",
+    "evaluate": "one truth, one matching; RMSE, NEES, GOSPA, scores",
     "tracks": "gates, association, lifecycle, noise: many objects",
     "identify": "one object or two, at a stated error",
     "filters": "what we believe: the recursion, batch and bank",
@@ -37,7 +37,7 @@ WORDS = {
 _COLOURS = (
     (("errors", "geo", "records", "io"), "#eef3ee", "#a9c2aa"),
     (("models", "simulate", "decisions", "filters", "identify", "tracks"), "#fbeeea", "#dba792"),
-    (("metrics", "montecarlo", "studies"), "#f3eef7", "#bfa9d1"),
+    (("evaluate", "montecarlo", "studies"), "#f3eef7", "#bfa9d1"),
     ((), "#e9f0f8", "#9db8d6"),
 )
 _LEFT, _WIDTH, _TOP, _FLOOR = 88, 300, 84, 34

@@ -9,6 +9,7 @@ import pyproj
 import pytest
 
 from saltus.demo import run_demo, score_demo, write_demo
+from saltus.evaluate.tables import read_reference
 from saltus.geo import wrap
 from saltus.simulate.scene import DURATION, demo_aircraft, demo_plane, demo_radars
 
@@ -107,7 +108,7 @@ def test_configuration_names_both_radars(demo):
 def test_truth_moves_as_its_velocity_says(demo):
     folder, _ = demo
     truth = pq.read_table(folder / "truth.parquet")
-    names = truth.column("aircraft").to_numpy()
+    names = truth.column("target_id").to_numpy()
     assert len(set(names)) == 14
     for name in ("SAL101", "SAL109", "SAL113"):
         rows = truth.filter(pa.array(names == name))
@@ -155,6 +156,9 @@ def perfect_tables(labels, shift=0.0, p_turning=0.9, p_straight=0.1):
             "time": MIDNIGHT + 36000.0 + t,
             "latitude": np.degrees(lat),
             "longitude": np.degrees(lon),
+            "cov_ee": np.full(len(t), 900.0),
+            "cov_en": np.zeros(len(t)),
+            "cov_nn": np.full(len(t), 900.0),
             "status": np.where(t < 20, "tentative", "confirmed"),
             "p_manoeuvre_h": np.where(motion.turning, p_turning, p_straight),
         }
@@ -163,10 +167,11 @@ def perfect_tables(labels, shift=0.0, p_turning=0.9, p_straight=0.1):
 
 
 def test_perfect_tracks_score_perfectly(demo):
-    _, simulated = demo
+    folder, simulated = demo
+    truth = read_reference(folder / "truth.parquet")
     tracks, assignments = perfect_tables(simulated.labels, shift=30.0)
-    score = score_demo(tracks, assignments, simulated.labels)
-    np.testing.assert_allclose(score.rmse, 30.0, rtol=1e-6)
+    score = score_demo(tracks, assignments, simulated.labels, truth)
+    np.testing.assert_allclose(score.rmse, 30.0, rtol=1e-4)  # metres of the plane are not quite those of the ground
     assert score.tracks.completeness == score.tracks.purity == score.tracks.fragmentation == 1.0
     assert score.false.n_false == 0
     assert score.p_turning == pytest.approx(0.9)
@@ -175,7 +180,8 @@ def test_perfect_tracks_score_perfectly(demo):
 
 
 def test_faults_are_counted(demo):
-    _, simulated = demo
+    folder, simulated = demo
+    truth = read_reference(folder / "truth.parquet")
     tracks, assignments = perfect_tables(simulated.labels)
     label = np.concatenate(simulated.labels)
     track = assignments.column("track_id").to_numpy().copy()
@@ -186,18 +192,20 @@ def test_faults_are_counted(demo):
     numbers = pa.array([None if np.isnan(x) else int(x) for x in track], pa.int64())
     assignments = assignments.set_column(2, "track_id", numbers)
     row = {"track_id": [900], "time": [MIDNIGHT + 36100.0], "latitude": [48.0], "longitude": [11.0]}
+    row |= {"cov_ee": [900.0], "cov_en": [0.0], "cov_nn": [900.0]}
     false_row = pa.table({**row, "status": ["confirmed"], "p_manoeuvre_h": [0.5]})
-    score = score_demo(pa.concat_tables([tracks, false_row]), assignments, simulated.labels)
+    score = score_demo(pa.concat_tables([tracks, false_row]), assignments, simulated.labels, truth)
     assert score.false.n_false == 1
     assert score.false.per_hour == pytest.approx(6.0)  # one in ten minutes
     assert score.tracks.per_object_completeness[2] == pytest.approx(0.75, abs=0.01)
 
 
 def test_no_tracks_at_all(demo):
-    _, simulated = demo
+    folder, simulated = demo
+    truth = read_reference(folder / "truth.parquet")
     tracks, assignments = perfect_tables(simulated.labels)
     nothing = pa.array([None] * len(assignments), pa.int64())
-    score = score_demo(tracks.slice(0, 0), assignments.set_column(2, "track_id", nothing), simulated.labels)
+    score = score_demo(tracks.slice(0, 0), assignments.set_column(2, "track_id", nothing), simulated.labels, truth)
     assert np.isnan(score.rmse).all()
     assert np.isnan(score.p_turning)
     assert score.false.n_false == 0

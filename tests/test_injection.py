@@ -11,10 +11,11 @@ from click.testing import CliRunner
 
 from saltus.cli import main
 from saltus.errors import DataError
+from saltus.evaluate.plots import Followed, Motion, downlinked, from_run, simulated
+from saltus.evaluate.reference import make_reference
 from saltus.injection import command
 from saltus.injection.figures import RUNS, errors, found, growth
 from saltus.injection.plots import AZIMUTH, RANGE, inject
-from saltus.injection.reference import Followed, Reference, downlinked, from_run, simulated
 from saltus.records import Kind, Plots, Source, System
 
 KNOT = 1852.0 / 3600.0
@@ -93,14 +94,14 @@ def test_what_is_no_table_is_no_reference(rng, tmp_path):
 
 
 def test_simulated_aircraft_are_interpolated():
-    truth = pa.table(
-        {
-            "aircraft": ["A", "A", "A", "B", "B", "B"],
-            "time": [0.0, 1.0, 2.0] * 2,
-            "ve": [0.0, 10.0, 20.0, 50.0, 50.0, 50.0],
-            "vn": [10.0, 10.0, 10.0, 0.0, 0.0, 0.0],
-            "turning": [False, True, True, False, False, False],
-        }
+    zeros = np.zeros(6)
+    truth = make_reference(
+        ["A", "A", "A", "B", "B", "B"],
+        [0.0, 1.0, 2.0] * 2,
+        zeros,
+        zeros,
+        velocity=[(0.0, 10.0), (10.0, 10.0), (20.0, 10.0), (50.0, 0.0), (50.0, 0.0), (50.0, 0.0)],
+        turning=[False, True, True, False, False, False],
     )
     found_ = simulated(np.array([0, 0, 1, -1, 1]), np.array([1.0, 0.0, 1.5, 1.0, 9.0]), truth)
     np.testing.assert_allclose(found_.course, [45.0, 0.0, 90.0, np.nan, np.nan])
@@ -117,7 +118,7 @@ def run_of(course, speed, p_fault, **columns):
 
 def test_figures_of_a_small_run():
     """Six plots of one track, one of a short one; course errors 1, 1, 2, 3 (across north) and 10 in the turn."""
-    reference = Reference(
+    reference = Motion(
         "x",
         np.array([10.0, 20.0, 30.0, 359.0, 50.0, 60.0, 0.0]),
         np.full(7, 100.0),
@@ -166,7 +167,7 @@ def test_the_study_of_the_simulated_scene(tmp_path, monkeypatch):
     def beginning(seed):
         recording, config, truth = whole(seed)
         early = recording.plots.time < recording.plots.time.min() + 50.0
-        cut = Reference(truth.name, *(column[early] for column in truth[1:]))
+        cut = Motion(truth.name, *(column[early] for column in truth[1:]))
         return replace(recording, plots=recording.plots.take(early)), config, cut
 
     monkeypatch.setattr(command, "_scene", beginning)

@@ -7,11 +7,15 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from saltus.evaluate import FalseTracks, Reference, TrackScores, false_tracks, track_scores
+from saltus.evaluate.matching import match_rows
+from saltus.evaluate.reference import each_time_once
+from saltus.evaluate.tables import read_reference, tracks_of
 from saltus.io.asterix_write import write_cat048
 from saltus.io.write import output_directory
-from saltus.metrics import FalseTracks, TrackScores, false_tracks, track_scores
 from saltus.simulate import Observations, observe
 from saltus.simulate.scene import DURATION, Aircraft, RadarStation, demo_aircraft, demo_plane, demo_radars
 
@@ -24,6 +28,8 @@ _DATE = "2025-06-01"
 _MIDNIGHT = np.datetime64(_DATE).astype("datetime64[s]").astype(np.int64).item()
 _START = 10 * 3600.0  # s after midnight: the scene's time 0
 _FILES = ("radar_a.ast", "radar_b.ast")
+_CUTOFF = 1000.0  # m: no track follows an aircraft from further away
+_SETTLED = 30.0  # s after a manoeuvre, from which flight counts as steady
 
 
 class Simulated(NamedTuple):
@@ -69,7 +75,8 @@ def run_demo(output: Path, seed: int) -> None:
         summary, lines = write_tracks(simulated.files, folder, bar, simulated.config)
     show_summary(summary, output, True, lines)
     tracks = pq.read_table(output / "tracks.parquet")
-    score = score_demo(tracks, pq.read_table(output / "assignments.parquet"), simulated.labels)
+    truth = read_reference(output / "truth.parquet")
+    score = score_demo(tracks, pq.read_table(output / "assignments.parquet"), simulated.labels, truth)
     console.print(_table(score))
     for line in _summary(score):
         console.print(line, soft_wrap=True)
@@ -147,7 +154,7 @@ def _truth(aircraft: Sequence[Aircraft]) -> pa.Table:
         state = np.stack([motion.position, motion.velocity], axis=-1)[:, :2].reshape(-1, 4)
         true = plane.to_true(state, np.zeros((len(state), 4, 4)), motion.position[:, 2])
         columns = {
-            "aircraft": pa.array([craft.name] * len(state)),
+            "target_id": pa.array([craft.name] * len(state)),
             "time": _MIDNIGHT + _START + seconds,
             "latitude": np.degrees(true.latitude),
             "longitude": np.degrees(true.longitude),
@@ -163,37 +170,33 @@ def _truth(aircraft: Sequence[Aircraft]) -> pa.Table:
     return pa.concat_tables(tables)
 
 
-def score_demo(tracks: pa.Table, assignments: pa.Table, labels: Sequence[npt.NDArray[np.int64]]) -> Score:
-    """Compare tracks with the truth through the plots they were made of.
+def score_demo(
+    tracks: pa.Table, assignments: pa.Table, labels: Sequence[npt.NDArray[np.int64]], truth: Reference
+) -> Score:
+    """Compare tracks with the truth: how plots were joined, and how near confirmed rows are to what they follow.
 
     Args:
         tracks: columns of tracks.parquet.
         assignments: columns of assignments.parquet.
         labels: of `Simulated`.
+        truth: where the aircraft were.
     """
     label, track = _labelled(assignments, labels)
-    columns = ("track_id", "time", "status", "p_manoeuvre_h", "latitude", "longitude")
-    ids, time, status, p, lat, lon = (tracks.column(name).to_numpy() for name in columns)
-    sure = status == "confirmed"
-    confirmed = np.unique(ids[sure])
-    xy, t = demo_plane().forward(np.radians(lat), np.radians(lon)), time - _MIDNIGHT - _START
-    owner = _owners(ids, track, label)
-    aircraft = demo_aircraft()
-    rmse, turning, straight = np.full(len(aircraft), np.nan), [np.empty(0)], [np.empty(0)]
-    for k, craft in enumerate(aircraft):
-        mine = sure & (owner == k)
-        motion = craft.trajectory.at(t[mine])
-        error_sq = np.sum((xy[mine] - motion.position[:, :2]) ** 2, axis=-1)
-        rmse[k] = np.sqrt(error_sq.mean()) if len(error_sq) else np.nan
-        turning.append(p[mine][motion.turning])
-        straight.append(p[mine][_steady(craft, t[mine])])
+    sure = tracks.filter(pc.equal(tracks["status"], "confirmed"))
+    sure = sure.take(each_time_once(sure["track_id"].to_numpy(), sure["time"].to_numpy()))
+    rows, p = tracks_of(sure, statuses=("confirmed",)), sure["p_manoeuvre_h"].to_numpy()
+    target, error = match_rows(rows, truth, cutoff=_CUTOFF)
+    turning, steady = truth.turned(target, rows.time), ~truth.turned(target, rows.time, _SETTLED)
+    confirmed = np.unique(rows.id)
+    aircraft = [craft.name for craft in demo_aircraft()]
+    squares = [np.square(error[target == truth.names.index(name)]).sum(axis=-1) for name in aircraft]
     return Score(
         tracks=track_scores(track, label, confirmed=confirmed),
         false=false_tracks(track, label, duration=DURATION, confirmed=confirmed),
         n_plots=np.bincount(label[label >= 0], minlength=len(aircraft)),
-        rmse=rmse,
-        p_turning=_mean(np.concatenate(turning)),
-        p_straight=_mean(np.concatenate(straight)),
+        rmse=np.array([np.sqrt(s.mean()) if len(s) else np.nan for s in squares]),
+        p_turning=_mean(p[(target >= 0) & turning]),
+        p_straight=_mean(p[(target >= 0) & steady]),
     )
 
 
@@ -208,22 +211,6 @@ def _labelled(
     for k, known in enumerate(labels):
         label[source == k] = known[record[source == k]]
     return label, assignments.column("track_id").fill_null(-1).to_numpy().astype(np.int64)
-
-
-def _owners(
-    ids: npt.NDArray[np.int64], track: npt.NDArray[np.int64], label: npt.NDArray[np.int64]
-) -> npt.NDArray[np.int64]:
-    """Aircraft that gave most plots of each row's track; -1 if it was clutter."""
-    names, row = np.unique(ids, return_inverse=True)
-    owners = [np.bincount(label[track == name] + 1, minlength=1).argmax() - 1 for name in names]
-    return np.array(owners, np.int64)[row] if len(names) else np.empty(0, np.int64)
-
-
-def _steady(craft: Aircraft, t: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
-    """Times at which an aircraft has flown straight for 30 s (it turns for longer than the step of 2 s)."""
-    lags = np.arange(0.0, 31.0, 2.0)
-    turned = craft.trajectory.at((t[:, None] - lags).reshape(-1)).turning.reshape(len(t), len(lags))
-    return np.asarray(~turned.any(axis=1))
 
 
 def _mean(values: npt.NDArray[np.float64]) -> float:

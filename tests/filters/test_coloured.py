@@ -8,10 +8,10 @@ from scipy.linalg import block_diag, expm
 
 from oracles import dense_kalman, error, flat_model, is_psd, textbook_imm
 from saltus.errors import DataError, ModelError, NumericalError
+from saltus.evaluate import consistency, nees
 from saltus.filters import imm_filter
 from saltus.filters.coloured import augmented_filter, coloured_filter
 from saltus.filters.coloured_model import augment, difference
-from saltus.metrics import consistency, nees
 from strategies import coloured_problems, quick, random_coloured, random_cov, random_trans, rngs
 
 BACKENDS = ["numpy", None]  # the definition, and whatever the package chooses where a compiled backend is present

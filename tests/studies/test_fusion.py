@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from oracles import dense_kalman, error
-from saltus.metrics import rmse
+from saltus.evaluate import rmse
 from saltus.studies.fusion import FILTERS, fixed_chains, matrices, run_fusion
 from saltus.studies.fusion_report import SEGMENTS, calibration_curve, fusion_metrics, fusion_study, lags
 

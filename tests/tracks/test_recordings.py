@@ -7,7 +7,7 @@ import pytest
 
 from saltus import io
 from saltus.config import load_config
-from saltus.metrics import track_scores
+from saltus.evaluate import track_scores
 from saltus.run import track_files
 
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import chi2
 from tracking_scenes import SITE, flights, measured, observed, polar_noise, run
 
+from saltus.evaluate import false_tracks, track_scores
 from saltus.geo import Plane
-from saltus.metrics import false_tracks, track_scores
 from saltus.simulate import Leg, Radar, Trajectory, observe
 from saltus.tracks.lifecycle import CONFIRMED
 from saltus.tracks.local import local_system

@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from saltus import montecarlo
 from saltus.errors import DataError, ModelError
+from saltus.evaluate import mean_over_runs, nees, rmse
 from saltus.gap.bound import informed_covariance
 from saltus.gap.contenders import FAST, Answer, Problem, candidates, reference_of
 from saltus.gap.model_file import Scenario, load_scenario
 from saltus.gap.result import LIMIT, Candidate, Figure, Gap, Group, verdict
-from saltus.metrics import mean_over_runs, nees, rmse
 from saltus.models import HybridModel
 from saltus.models.augment import augmented
 from saltus.simulate import simulate_hybrid

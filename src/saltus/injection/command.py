@@ -9,19 +9,20 @@ from pathlib import Path
 import click
 import numpy as np
 import numpy.typing as npt
-import pyarrow.parquet as pq
 
 from saltus import io
 from saltus.config import Config, load_config, parse_date
 from saltus.demo import write_demo
 from saltus.errors import ModelError
+from saltus.evaluate.plots import OWN_RUN, Followed, Motion, downlinked, followed, from_run, simulated
+from saltus.evaluate.tables import read_reference
 from saltus.injection.figures import RUNS, draw, errors, found, growth
 from saltus.injection.plots import inject
-from saltus.injection.reference import OWN_RUN, Followed, Reference, downlinked, followed, from_run, simulated
 from saltus.io.write import output_directory
 from saltus.progress import progress_bar
 from saltus.records import Kind, Recording
 from saltus.run import track_recording
+from saltus.simulate.scene import demo_aircraft
 
 __all__ = ["study_faults"]
 
@@ -80,19 +81,20 @@ def study_faults(
     return metrics
 
 
-def _scene(seed: int) -> tuple[Recording, Config, Reference]:
+def _scene(seed: int) -> tuple[Recording, Config, Motion]:
     with tempfile.TemporaryDirectory() as name:
         scene = write_demo(Path(name) / "scene", seed)
         config = load_config(scene.config)
         recording = io.read(scene.files, date=config.date, editions=config.editions)
-        truth = pq.read_table(scene.config.with_name("truth.parquet"))
+        truth = read_reference(scene.config.with_name("truth.parquet"))
     files = {path.name: labels for path, labels in zip(scene.files, scene.labels, strict=True)}
     plots = recording.plots
     label = np.full(len(plots), -1, np.int64)
     for f, file in enumerate(plots.files):
         mine = (plots.file == f) & (plots.kind == Kind.POLAR)
         label[mine] = files[Path(file).name][plots.record[mine]]
-    return recording, config, simulated(label, plots.time, truth)
+    names = np.array([*(truth.names.index(craft.name) for craft in demo_aircraft()), -1])
+    return recording, config, simulated(names[label], plots.time, truth)
 
 
 def _track(recording: Recording, config: Config, seed: int) -> tuple[npt.NDArray[np.int8], dict[str, Followed]]:
@@ -111,7 +113,7 @@ def _track(recording: Recording, config: Config, seed: int) -> tuple[npt.NDArray
 
 
 def _metrics(
-    recording: Recording, fault: npt.NDArray[np.int8], runs: dict[str, Followed], truth: Reference, folder: Path
+    recording: Recording, fault: npt.NDArray[np.int8], runs: dict[str, Followed], truth: Motion, folder: Path
 ) -> dict[str, object]:
     plots = recording.plots
     judged = {name: errors(run, truth) for name, run in runs.items()}

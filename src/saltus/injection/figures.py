@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from saltus.evaluate.plots import KNOT, Followed, Motion
 from saltus.injection.plots import AZIMUTH, RANGE
-from saltus.injection.reference import KNOT, Followed, Reference
 from saltus.records import Kind, Plots
 from saltus.studies.style import BLUE, GREY, ORANGE, TEAL, new_figure, save
 
@@ -22,7 +22,7 @@ _Array = npt.NDArray[np.float64]
 _Figures = dict[str, float | None]
 
 
-def errors(run: Followed, reference: Reference) -> tuple[_Figures, dict[str, _Array]]:
+def errors(run: Followed, reference: Motion) -> tuple[_Figures, dict[str, _Array]]:
     """Judge a run: figures, and the errors themselves, on tracks of 5 plots and more of what is faster than 100 kt."""
     number, count = np.unique(run.track[run.track > 0], return_counts=True)
     long = np.isin(run.track, number[count >= _MIN_TRACK])

@@ -17,11 +17,11 @@ import numpy.typing as npt
 from jaxtyping import Float
 
 from saltus import montecarlo
+from saltus.evaluate.estimation import nees
 from saltus.filters import Estimates, coloured_filter, imm_filter
 from saltus.filters.coloured import after_first, run_differenced
 from saltus.filters.coloured_model import Augmented
 from saltus.linalg import block_diagonal
-from saltus.metrics.estimation import nees
 from saltus.models import discretise
 
 __all__ = ["FILTERS", "PAPER_RATE", "STEPS", "Trial", "follow", "oscillator", "run_coloured", "scripted_modes"]

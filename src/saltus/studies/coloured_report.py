@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from saltus.metrics.estimation import Interval, consistency, mean_over_runs, rmse
+from saltus.evaluate.estimation import Interval, consistency, mean_over_runs, rmse
 from saltus.studies.coloured import FILTERS, PAPER_RATE, STEPS, Trial, run_coloured
 from saltus.studies.coloured_figures import draw_paper, draw_value
 

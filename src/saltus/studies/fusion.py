@@ -17,8 +17,8 @@ import numpy.typing as npt
 from jaxtyping import Float, Int
 
 from saltus import montecarlo
+from saltus.evaluate import nees
 from saltus.filters import Estimates, imm_filter
-from saltus.metrics import nees
 from saltus.models import discretise
 
 __all__ = [

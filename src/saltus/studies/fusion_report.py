@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from saltus.metrics.estimation import Interval, mean_over_runs, rmse
+from saltus.evaluate.estimation import Interval, mean_over_runs, rmse
 from saltus.studies.fusion import CHAINS, FILTERS, STATES, STEPS, Chains, Trial, Variant, fixed_chains, run_fusion
 from saltus.studies.fusion_figures import draw_fusion
 

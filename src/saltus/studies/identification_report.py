@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from saltus.evaluate import mean_over_runs
 from saltus.identify import DIFFERENT, SAME, UNDECIDED, p_correct, p_false, sprt
-from saltus.metrics import mean_over_runs
 from saltus.studies.identification import (
     AFTER,
     ASKED,

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from saltus.alarms import alarms
-from saltus.metrics import mean_over_runs, rmse
-from saltus.metrics.estimation import Interval
+from saltus.evaluate import mean_over_runs, rmse
+from saltus.evaluate.estimation import Interval
 from saltus.studies.jamming import FAULTS, FILTERS, FIRST, LENGTH, PERIOD, SIZE, STEPS, Trial, conditions, run_jamming
 from saltus.studies.style import BLUE, GREY, ORANGE, TEAL, new_figure, save, shade
 

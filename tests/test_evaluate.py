@@ -8,7 +8,8 @@ import pytest
 from scipy import stats
 
 from saltus.errors import DataError, ModelError
-from saltus.metrics import (
+from saltus.evaluate import (
+    Tracks,
     consistency,
     false_tracks,
     gospa,
@@ -19,6 +20,9 @@ from saltus.metrics import (
     rmse,
     track_scores,
 )
+from saltus.evaluate.matching import match_rows
+from saltus.evaluate.reference import make_reference
+from saltus.geo import geodetic_to_ecef
 
 # --- sets -------------------------------------------------------------------------------------------------
 
@@ -235,3 +239,68 @@ def test_track_scores_refuse_what_cannot_be():
         track_scores([1], [1], min_plots=0)
     with pytest.raises(ModelError, match="duration"):
         false_tracks([1], [1], duration=0.0)
+
+
+def circle(time, radius=3000.0, speed=150.0):
+    """A steady turn near 45 N 5 E: rad, rad, and velocity east and north."""
+    angle = speed / radius * time
+    lat0, lon0 = np.radians([45.0, 5.0])
+    meridian, normal = (
+        6378137.0 * (1 - 0.00669438) / (1 - 0.00669438 / 2) ** 1.5,
+        6378137.0 / np.sqrt(1 - 0.00669438 / 2),
+    )
+    lat = lat0 + radius * np.sin(angle) / meridian
+    lon = lon0 + radius * np.cos(angle) / (normal * np.cos(lat))
+    return lat, lon, speed * np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+
+
+def test_a_turn_is_interpolated_by_its_velocities():
+    """A straight line cuts a turn of 7.5 m/s^2 between fixes 4 s apart by a T^2 / 8 = 15 m; the cubic by decimetres."""
+    fixes, between = np.arange(0.0, 100.0, 4.0), np.arange(2.0, 90.0, 4.0)
+    lat, lon, velocity = circle(fixes)
+    true_lat, true_lon, true_velocity = circle(between)
+    true = geodetic_to_ecef(true_lat, true_lon, 0.0)
+    zero = np.zeros(len(between), np.intp)
+    curved = make_reference(["x"] * len(fixes), fixes, lat, lon, velocity=velocity).at(zero, between)
+    straight = make_reference(["x"] * len(fixes), fixes, lat, lon).at(zero, between)
+    # a T^4 / 384 times the fourth derivative: 3000 m (0.05/s)^4 4^4 / 384 = 0.0125 m, and the ellipsoid's radii here.
+    assert np.linalg.norm(curved.place - true, axis=-1).max() < 0.5
+    np.testing.assert_allclose(np.linalg.norm(straight.place - true, axis=-1), 15.0, rtol=0.02)
+    assert np.linalg.norm(curved.velocity - true_velocity, axis=-1).max() < 1.0
+    assert np.isnan(straight.velocity).all()
+
+
+def test_nothing_is_known_beyond_the_fixes_and_across_gaps():
+    lat, lon, velocity = circle(np.array([0.0, 4.0, 30.0]))
+    truth = make_reference(["x"] * 3, [0.0, 4.0, 30.0], lat, lon, velocity=velocity, turning=[True, False, False])
+    known = np.isfinite(
+        truth.at(np.array([0, 0, 0, 0, 0, 1]), np.array([-1.0, 2.0, 17.0, 30.0, 31.0, 2.0])).place[:, 0]
+    )
+    assert known.tolist() == [False, True, False, True, False, False]
+    zero = np.zeros(4, np.intp)
+    assert truth.turned(zero, np.array([1.0, 3.0, 4.0, 30.0])).tolist() == [True, False, False, False]
+    assert truth.turned(zero, np.array([1.0, 3.0, 4.0, 30.0]), within=5.0).tolist() == [True, True, True, False]
+
+
+def test_rows_are_judged_at_their_own_times():
+    """Two targets pass each other; rows fall between the truth's seconds, and a track keeps its own target."""
+    t = np.arange(0.0, 20.0)
+    east = np.concatenate([10.0 * t - 100.0, 100.0 - 10.0 * t])
+    north = np.repeat([0.0, 40.0], 20)
+    lat0, lon0 = np.radians([45.0, 5.0])
+    where = [(lat0 + n / 6.37e6, lon0 + e / (6.37e6 * np.cos(lat0))) for e, n in zip(east, north, strict=True)]
+    lat, lon = np.array(where).T
+    truth = make_reference(np.repeat(["a", "b"], 20), np.tile(t, 2), lat, lon)
+    rows = np.arange(0.25, 19.0, 4.0)
+    places = [truth.at(np.full(len(rows), k), rows).place for k in (1, 0)]
+    cov = np.tile(np.eye(2), (2 * len(rows), 1, 1))
+    tracks = Tracks(
+        np.repeat([7, 9], len(rows)), np.tile(rows, 2), np.concatenate(places) + np.array([0.0, 0.0, 3.0]), cov
+    )
+    target, error = match_rows(tracks, truth, cutoff=60.0)
+    assert target.tolist() == [1] * 5 + [0] * 5
+    np.testing.assert_allclose(error, [[0.0, 3.0 * np.cos(lat0)]] * 10, atol=1e-3)
+    far = tracks._replace(place=tracks.place + np.array([0.0, 500.0, 0.0]))
+    assert (match_rows(far, truth, cutoff=60.0)[0] == -1).all()
+    late = tracks._replace(time=tracks.time + 1000.0)
+    assert np.isnan(match_rows(late, truth, cutoff=60.0)[1]).all()

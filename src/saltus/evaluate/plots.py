@@ -9,9 +9,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from saltus.errors import DataError
+from saltus.evaluate.reference import Reference
 from saltus.records import Plots
 
-__all__ = ["OWN_RUN", "Followed", "Reference", "downlinked", "followed", "from_run", "simulated"]
+__all__ = ["KNOT", "OWN_RUN", "Followed", "Motion", "downlinked", "followed", "from_run", "simulated"]
 
 _Array = npt.NDArray[np.float64]
 _Mask = npt.NDArray[np.bool_]
@@ -24,7 +25,7 @@ _COLUMNS = ("time", "rho_nm", "theta_deg", "bds50_track_deg", "bds50_roll_deg", 
 _COVERED = 0.99  # of the radar plots that a reference must know
 
 
-class Reference(NamedTuple):
+class Motion(NamedTuple):
     """True course and speed at each plot."""
 
     name: str
@@ -63,7 +64,7 @@ def followed(plots: Plots, tracks: pa.Table, assigned: pa.Table) -> Followed:
     return Followed(track, course, speed, p_fault, p_manoeuvre, confirmed[row])
 
 
-def downlinked(plots: Plots, path: Path) -> Reference:
+def downlinked(plots: Plots, path: Path) -> Motion:
     """Track angle, roll and ground speed that aircraft sent with each plot (BDS 5,0), from a table of the same plots.
 
     Straight is less than 3 degrees of roll, turning more than 10.
@@ -96,7 +97,7 @@ def downlinked(plots: Plots, path: Path) -> Reference:
     course, roll, knots = (np.where(at >= 0, values[at], np.nan) for values in (course, roll, knots))
     known = np.isfinite(course + roll + knots)
     bank = np.abs(np.where(known, roll, np.nan))
-    return Reference(f"BDS 5,0 in {path.name}", course, knots * KNOT, bank < _STRAIGHT, bank > _TURN)
+    return Motion(f"BDS 5,0 in {path.name}", course, knots * KNOT, bank < _STRAIGHT, bank > _TURN)
 
 
 def _keys(time: _Array, slant: _Array, azimuth: _Array) -> list[tuple[int, ...]]:
@@ -108,33 +109,25 @@ def _keys(time: _Array, slant: _Array, azimuth: _Array) -> list[tuple[int, ...]]
     return list(zip(*(r.tolist() for r in raw), strict=True))
 
 
-def simulated(label: npt.NDArray[np.int64], time: _Array, truth: pa.Table) -> Reference:
-    """Course, speed and turning of simulated aircraft, interpolated between the truth's seconds.
+def simulated(target: npt.NDArray[np.int64], time: _Array, truth: Reference) -> Motion:
+    """Course, speed and turning of simulated aircraft.
 
     Args:
-        label: of each plot, number of the aircraft in the order of the truth, -1 none.
+        target: of each plot, index into the truth's names, -1 none.
         time: of each plot, s.
-        truth: columns aircraft, time, ve, vn, turning.
+        truth: with velocities.
     """
-    east, north = np.full(len(label), np.nan), np.full(len(label), np.nan)
-    turning = np.zeros(len(label), bool)
-    names = np.array(truth["aircraft"].to_pylist())
-    columns = {n: truth[n].to_numpy(zero_copy_only=False).astype(np.float64) for n in ("time", "ve", "vn", "turning")}
-    for k, name in enumerate(dict.fromkeys(names.tolist())):
-        own, mine = names == name, label == k
-        at = columns["time"][own]
-        for out, column in ((east, "ve"), (north, "vn")):
-            out[mine] = np.interp(time[mine], at, columns[column][own], left=np.nan, right=np.nan)
-        turning[mine] = np.interp(time[mine], at, columns["turning"][own]) > 0.5
-    known = np.isfinite(east)
+    known = truth.at(target, time)
+    east, north = known.velocity.T
+    told, turning = np.isfinite(east), truth.turned(target, time)
     course = np.degrees(np.arctan2(east, north)) % 360.0
-    return Reference("the simulation's truth", course, np.hypot(east, north), known & ~turning, known & turning)
+    return Motion("the simulation's truth", course, np.hypot(east, north), told & ~turning, told & turning)
 
 
-def from_run(run: Followed) -> Reference:
+def from_run(run: Followed) -> Motion:
     """Take a run over clean plots for the truth: straight is where it thinks so."""
     known = np.isfinite(run.course)
-    return Reference(
+    return Motion(
         OWN_RUN,
         run.course,
         run.speed,
