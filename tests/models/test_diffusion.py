@@ -207,8 +207,8 @@ def test_angles_are_found_and_sensors_stacked():
 
 
 def test_what_has_no_stochastic_equation_is_not_lowered():
-    with pytest.raises(ModelError, match="kind='white'"):
-        as_diffusion(two_chains(dynamics=constant_velocity(dims=1, accel=1.0)))
+    with pytest.raises(ModelError, match="kind='lasting'"):
+        as_diffusion(two_chains(dynamics=constant_velocity(dims=1, accel=1.0, kind="scan")))
     white = constant_velocity(dims=1, accel=1.0, kind="white")
     assert as_diffusion(two_chains(dynamics=white))[0].n_state == 2
     step = Chain("turn", ["no", "yes"], stay=0.9)

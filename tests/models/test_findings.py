@@ -77,6 +77,23 @@ def test_what_one_mode_hides():
     assert "x[0], x[1]" in found[0].message
 
 
+def test_motion_that_belongs_to_intervals():
+    scan = HybridModel([MODE], constant_velocity(1, accel=lambda mode: mode, kind="scan"), SEEN, PRIOR)
+    assert [f.kind for f in scan.check()] == ["per-interval"]
+    assert scan.check(times=[0.0, 4.0, 8.001, 8.001, 12.0]) == []
+    found = scan.check(times=[0.0, 4.0, 8.0, 16.0, 20.0])  # at 4 s: accel * 8 against accel * sqrt(2) * 4
+    assert found[0].message.startswith("over 8 s x[1] is disturbed by 8, over two intervals of 4 s by 5.66: a missed")
+    own = LinearTransition(F=lambda dt: [[1.0, dt], [0.0, 1.0]], Q=lambda dt: dt * np.eye(2))
+    assert kinds([], own) == ["per-interval"]  # Q is not that of white noise through F
+
+
+def test_motion_that_belongs_to_time():
+    for motion in (CV, constant_velocity(1, accel=2.0, kind="white"), LinearSDE(CV_F, CV_G, [0.0, 3.0])):
+        assert HybridModel([], motion, SEEN, PRIOR).check(times=[0.0, 1.0, 5.0]) == []
+    drifts = LinearTransition(F=lambda dt: np.eye(2), Q=lambda dt: dt * np.eye(2), b=lambda dt: [0.0, 3.0 * dt])
+    assert kinds([], drifts, {"s": PositionSensor(2, 1.0)}) == []
+
+
 def test_units_do_not_hide_observability():
     # Position in metres, speed in units of 1e9 m/s: observable all the same.
     scaled = LinearSDE([[0.0, 1e9], [0.0, 0.0]], [[0.0], [1e-9]])

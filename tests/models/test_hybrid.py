@@ -67,7 +67,7 @@ def test_equal_intervals_have_no_time_axis():
 def test_filter_takes_the_arrays(rng):
     # One row of the filter against the rows written out: two states, scalar algebra in matrix form.
     z = rng.normal(size=(1, 2)) * 50
-    a = a_model(chains=[RADAR], dynamics=constant_velocity(2, accel=3.0)).compile(dt=4.0)
+    a = a_model(chains=[RADAR], dynamics=constant_velocity(2, accel=3.0, kind="scan")).compile(dt=4.0)
     estimates = imm_filter(z, **a._asdict())
     F = np.kron(np.eye(2), [[1.0, 4.0], [0.0, 1.0]])
     g = np.array([8.0, 4.0])
@@ -152,7 +152,7 @@ def test_compares_prints_and_pickles():
     model = a_model()
     assert pickle.loads(pickle.dumps(model)) == model == a_model()
     assert model != a_model(chains=[RADAR, TURN])
-    assert "manoeuvre" in repr(model) and "velocity-scan" in repr(model)
+    assert "manoeuvre" in repr(model) and "law='velocity'" in repr(model)
     assert model.chain("manoeuvre") == TURN
 
 

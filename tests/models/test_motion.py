@@ -7,6 +7,9 @@ from saltus.models import Chain, constant_acceleration, constant_velocity, discr
 
 WHITE = [
     constant_velocity(2, accel=[0.5, 2.0], kind="white"),
+    constant_velocity(2, accel=[0.5, 2.0]),
+    constant_velocity(2, accel=3.0, accel_time=[2.0, 0.5]),
+    constant_velocity(3, accel=[0.5, 0.5, 0.1], accel_time=10.0, turn=0.05),
     constant_acceleration(2, jerk=0.3),
     singer(2, tau=20.0, sigma=[1.0, 3.0]),
     constant_velocity(2, accel=0.5, kind="white", turn=0.03),
@@ -75,7 +78,7 @@ def test_singer_acceleration_is_stationary():
 
 def test_acceleration_constant_within_a_scan():
     T, sigma = 10.0, np.array([3.0, 35.0])
-    step = constant_velocity(2, accel=sigma).step(np.asarray(T))
+    step = constant_velocity(2, accel=sigma, kind="scan").step(np.asarray(T))
     g = np.array([T**2 / 2, T])
     F, Q = np.zeros((4, 4)), np.zeros((4, 4))
     for axis in range(2):  # x, vx, y, vy
@@ -83,6 +86,13 @@ def test_acceleration_constant_within_a_scan():
         F[part, part], Q[part, part] = [[1, T], [0, 1]], sigma[axis] ** 2 * np.outer(g, g)
     np.testing.assert_allclose(step.F, F)
     np.testing.assert_allclose(step.Q, Q)
+
+
+def test_acceleration_that_lasts_spreads_the_velocity_of_its_time_as_a_constant_one():
+    lasting = constant_velocity(1, accel=3.0, accel_time=10.0).step(np.asarray(10.0)).Q
+    scan = constant_velocity(1, accel=3.0, kind="scan").step(np.asarray(10.0)).Q
+    np.testing.assert_allclose(lasting[1, 1], scan[1, 1])
+    np.testing.assert_allclose(lasting, constant_velocity(1, accel=90.0, kind="white").step(np.asarray(10.0)).Q)
 
 
 @pytest.mark.parametrize("motion", WHITE, ids=lambda m: m.law if m.turn is None else f"turn {float(m.turn)}")
@@ -112,6 +122,9 @@ def test_parameters_depend_on_chains():
         (lambda: constant_velocity(2, accel=1.0, kind="scan").sde(), "has no stochastic differential equation"),
         (lambda: constant_velocity(1, accel=1.0, turn=0.1), "a turn needs a plane: dims must be 2 or more, got 1"),
         (lambda: constant_velocity(2, accel=[1.0, 2.0], turn=0.1), "accel must be equal on the first two axes"),
+        (lambda: constant_velocity(2, accel=1.0, accel_time=[1.0, 2.0], turn=0.1), "accel_time must be equal on the"),
+        (lambda: constant_velocity(2, accel=1.0, accel_time=0.0), "accel_time must be positive, got 0"),
+        (lambda: constant_velocity(2, accel=1.0, kind="white", accel_time=1.0), "goes with kind='lasting', not with"),
         (lambda: constant_acceleration(1, jerk=np.nan), "jerk holds nan"),
         (lambda: singer(1, tau=0.0, sigma=1.0), "tau must be positive, got 0"),
         (lambda: singer(1, tau=1.0, sigma="big"), "sigma must be real numbers"),
@@ -127,7 +140,7 @@ def test_a_turn_goes_to_the_right_along_a_circle():
     # North at 10 m/s, 90 degrees to the right in 30 s: a quarter of the circle of radius v/turn about (r, 0).
     T, turn = 30.0, np.pi / 60.0
     radius = 10.0 / turn
-    for kind in ("scan", "white"):
+    for kind in ("lasting", "scan", "white"):
         F = constant_velocity(2, accel=1.0, kind=kind, turn=turn).step(np.asarray(T)).F
         np.testing.assert_allclose(F @ [0.0, 0.0, 0.0, 10.0], [radius, 10.0, radius, 0.0], atol=1e-12)
 
@@ -136,7 +149,7 @@ def test_a_turn_goes_to_the_right_along_a_circle():
 def test_acceleration_constant_in_a_turn_by_quadrature(u):
     # Impulse responses by Gauss-Legendre from F alone, which its own test checks; entries down to dt^4 u.
     T, sigma = 4.0, 3.0
-    motion = constant_velocity(2, accel=sigma, turn=u / T)
+    motion = constant_velocity(2, accel=sigma, kind="scan", turn=u / T)
     nodes, weights = leggauss(30)
     F = motion.step((nodes + 1) / 2 * T).F
     gain = np.einsum("s,sij->ij", weights / 2 * T, F[:, :, [1, 3]])  # to accelerations along x and y
@@ -144,7 +157,7 @@ def test_acceleration_constant_in_a_turn_by_quadrature(u):
     np.testing.assert_allclose(motion.step(np.asarray(T)).Q, expected, rtol=1e-12, atol=1e-13 * expected.max())
 
 
-@pytest.mark.parametrize("kind", ["scan", "white"])
+@pytest.mark.parametrize("kind", ["lasting", "scan", "white"])
 def test_without_turn_it_is_constant_velocity(kind):
     chain = Chain("way", {"straight": 0.0, "right": 0.05}, stay=0.9)
     dt = np.array([0.0, 0.5, 4.0])

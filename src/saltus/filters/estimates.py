@@ -1,6 +1,6 @@
 """The history a filter returns."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -8,8 +8,10 @@ from jaxtyping import Float
 
 from saltus.decisions import Decision, decide
 from saltus.errors import ModelError
+from saltus.models.findings import Finding, per_interval
+from saltus.models.hybrid import HybridModel
 
-__all__ = ["Estimates"]
+__all__ = ["Estimates", "described"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +36,8 @@ class Estimates:
         effective: share of the particles that count after each measurement (particle filters), else None.
         chains: names of the chains, in axis order.
         times: times of the rows in s, or None.
+        findings: what is doubtful about the model with these times (filters of a described model), as
+            `HybridModel.check` says it.
     """
 
     probs: Float[np.ndarray, "*modes"]
@@ -49,6 +53,7 @@ class Estimates:
     effective: Float[np.ndarray, "*rows"] | None = None
     chains: tuple[str, ...] = ()
     times: Float[np.ndarray, " t"] | None = None
+    findings: tuple[Finding, ...] = ()
 
     def prob(self, *chains: str | int) -> Float[np.ndarray, "*rows_m"]:
         """Return the marginal probabilities of one chain, (*batch, T, M), or the joint ones of several.
@@ -93,3 +98,9 @@ class Estimates:
         if not 0 <= chain < self._n_chains:
             raise ModelError(f"chain {chain} does not exist: there are {self._n_chains}, counted from 0.")
         return chain
+
+
+def described(found: Estimates, model: HybridModel, times: Float[np.ndarray, " t"]) -> Estimates:
+    """Add what the model and the times of the rows say of estimates: names, times, findings."""
+    names = tuple(chain.name for chain in model.chains)
+    return replace(found, chains=names, times=times, findings=tuple(per_interval(model, times)))

@@ -30,7 +30,7 @@ import numpy.typing as npt
 from saltus.errors import ModelError
 from saltus.filters import steps
 from saltus.filters.align import Aligned, align
-from saltus.filters.estimates import Estimates
+from saltus.filters.estimates import Estimates, described
 from saltus.filters.flat import Flat, flatten
 from saltus.filters.histories import EXACT, Histories, MergingRule, merged
 from saltus.filters.run import Record, in_order
@@ -132,7 +132,7 @@ class ExactFilter:
         layout, arrays = self.model.arrays_for(times, names)
         z = layout.stack(names, [record.z for record in listed])
         found = exact_filter(z, **arrays._asdict(), rule=self.rule, per_mode=self.per_mode)
-        return replace(found, chains=tuple(chain.name for chain in self.model.chains), times=times)
+        return described(found, self.model, times)
 
 
 class _Row(NamedTuple):

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from saltus.errors import DataError, ModelError
 from saltus.filters.align import align
 from saltus.filters.bootstrap import Moves, bootstrap, diffusion_moves, hybrid_moves
-from saltus.filters.estimates import Estimates
+from saltus.filters.estimates import Estimates, described
 from saltus.filters.flat import flatten
 from saltus.filters.observation import elapsed, measured, observation
 from saltus.filters.particles import generator
@@ -92,7 +92,7 @@ class ParticleFilter:
         found = self._drawn(
             diffusion_moves(given.model, given.dts, self.substeps), given.sensor, given.z, given.dts, source
         )
-        return _shaped(found, given.batch, (given.model.n_modes,), given.times, ())
+        return _shaped(found, given.batch, (given.model.n_modes,), given.times)
 
     def _hybrid(
         self, model: HybridModel, names: Sequence[str], z: _Array, times: _Array, t0: float, rng: np.random.Generator
@@ -100,18 +100,17 @@ class ParticleFilter:
         if times.ndim != 1 or z.ndim < 2 or z.shape[-2] != len(times):
             raise DataError(f"z must be (..., T, m) for T times (T,); got z {z.shape} and times {times.shape}.")
         dts = elapsed(times, t0)
-        chains = tuple(chain.name for chain in model.chains)
         if all(isinstance(model.sensors.get(name), LinearSensor | None) for name in names):
             arrays = model.compile(dt=dts, sensor=names)._asdict()
             found = particle_filter(z, **arrays, n_particles=self.n, groups=self.groups, rng=rng)
-            return replace(found, chains=chains, times=times)
+            return described(found, model, times)
         sensor = as_diffusion_sensor(model, names)
         arrays = model.compile(dt=dts, sensor=())._asdict()
         C, n = len(model.chains), model.n_state
         arrays["H"], arrays["R"] = np.zeros((1,) * C + (1, n)), np.ones((1,) * C + (1, 1))  # nothing linear is seen
         flat = flatten(align(np.zeros((len(times), 1)), **arrays))
         found = self._drawn(hybrid_moves(flat), sensor, z.reshape(-1, *z.shape[-2:]), dts, rng)
-        return _shaped(found, z.shape[:-2], model.sizes, times, chains)
+        return described(_shaped(found, z.shape[:-2], model.sizes, times), model, times)
 
     def _drawn(
         self, moves: Moves, sensor: DiffusionSensor, z: _Array, dts: _Array, rng: np.random.Generator
@@ -175,9 +174,7 @@ class BoundParticleFilter:
         return z
 
 
-def _shaped(
-    found: Estimates, batch: tuple[int, ...], sizes: tuple[int, ...], times: _Array, chains: tuple[str, ...]
-) -> Estimates:
+def _shaped(found: Estimates, batch: tuple[int, ...], sizes: tuple[int, ...], times: _Array) -> Estimates:
     """Give (B, T, ...) its batch axes, and the modes theirs."""
     T = len(times)
 
@@ -197,6 +194,5 @@ def _shaped(
         n_observed=rows(found.n_observed),
         error=rows(found.error),
         effective=rows(found.effective),
-        chains=chains,
         times=times,
     )

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from saltus.errors import DataError, ModelError, SaltusError
 from saltus.filters import steps
 from saltus.filters.coloured_run import filter_coloured
-from saltus.filters.estimates import Estimates
+from saltus.filters.estimates import Estimates, described
 from saltus.filters.imm import imm_filter
 from saltus.filters.linearise import Linearisation, sensor_update
 from saltus.models import Arrays, BoundSensor, HybridModel, LinearSensor, Observer
@@ -99,7 +99,7 @@ class IMM:
             found = filter_coloured(self.model, names, values, times, per_mode=self.per_mode)
         else:
             found = self._at_once(self.model, listed, times) if plain else self._one_by_one(self.model, listed, times)
-        return replace(found, chains=tuple(chain.name for chain in self.model.chains), times=times)
+        return described(found, self.model, times)
 
     def _at_once(self, model: HybridModel, records: Sequence[Record], times: _Array) -> Estimates:
         names = [record.sensor for record in records]

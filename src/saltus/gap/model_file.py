@@ -18,6 +18,7 @@ sojourn = {ok = 300.0, jammed = 30.0}
 kind = "constant_velocity"              # or constant_acceleration, singer, linear (F, G, drift), transition (F, Q, b)
 dims = 2
 accel = {by = {manoeuvre = {cruise = 0.3, turn = 8.0}}}
+accel_time = 4.0                        # s that an acceleration lasts; or law = "white" or "scan", without a time
 
 [sensor.radar]
 kind = "position"                       # or linear (H, R, d), polar (sigma_range, sigma_azimuth, ...)
@@ -65,7 +66,11 @@ __all__ = ["Scenario", "load_scenario"]
 
 _DYNAMICS: dict[str, tuple[Callable[..., Any], tuple[str, ...], tuple[str, ...]]] = {
     # kind: builder, needed keys, further keys
-    "constant_velocity": (lambda law="scan", **v: constant_velocity(kind=law, **v), ("dims", "accel"), ("law",)),
+    "constant_velocity": (
+        lambda law="lasting", **v: constant_velocity(kind=law, **v),
+        ("dims", "accel"),
+        ("law", "accel_time"),
+    ),
     "constant_acceleration": (constant_acceleration, ("dims", "jerk"), ()),
     "singer": (singer, ("dims", "tau", "sigma"), ()),
     "linear": (LinearSDE, ("F", "G"), ("drift",)),

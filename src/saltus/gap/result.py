@@ -8,6 +8,7 @@ __all__ = ["LIMIT", "Candidate", "Figure", "Gap", "Group", "verdict"]
 
 LIMIT = 0.05  # loss of RMSE from which another filter is worth its time
 _DOUBTFUL = 0.25  # posterior standard deviations: with such an error of its own a reference is none
+_ROUND_OFF = 1e-9  # of a ratio of RMSE: two filters that compute the same thing
 
 
 class Figure(NamedTuple):
@@ -134,7 +135,7 @@ def spread(f: Figure) -> str:
 def verdict(gap: Gap, linear: bool) -> str:
     """Say in words what the figures mean."""
     loss = gap.groups[gap.worst].loss
-    if gap.reference_error > _DOUBTFUL or any(g.loss.high < 0 for g in gap.groups.values()):
+    if gap.reference_error > _DOUBTFUL or any(g.loss.high < -_ROUND_OFF for g in gap.groups.values()):
         return (
             f"No verdict: the reference itself is off by {gap.reference_error:.2f} posterior standard deviations, "
             "or worse than what it is to judge. Take more particles (--particles)."

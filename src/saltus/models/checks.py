@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from saltus.errors import ModelError
 
-__all__ = ["FloatArray", "covariance", "intervals", "numbers", "probability", "same", "unit_steps"]
+__all__ = ["FloatArray", "covariance", "equal_intervals", "intervals", "numbers", "probability", "same", "unit_steps"]
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
@@ -94,6 +94,11 @@ def probability(value: float, what: str) -> None:
         raise ModelError(f"{what} must lie in (0, 1], got {value!r}.")
 
 
+def equal_intervals(steps: FloatArray) -> bool:
+    """Whether positive intervals differ by no more than 0.1 %."""
+    return not steps.size or bool(steps.max() - steps.min() <= _EQUAL_INTERVALS * steps.max())
+
+
 def unit_steps(dt: FloatArray, what: str, remedy: str) -> npt.NDArray[np.int64]:
     """Count steps for a description that is per step: 0 where dt is 0, 1 elsewhere.
 
@@ -101,7 +106,7 @@ def unit_steps(dt: FloatArray, what: str, remedy: str) -> npt.NDArray[np.int64]:
         ModelError: the positive intervals differ by more than 0.1 %.
     """
     positive = dt[dt > 0]
-    if positive.size and positive.max() - positive.min() > _EQUAL_INTERVALS * positive.max():
+    if not equal_intervals(positive):
         raise ModelError(
             f"{what} is per step and needs equal intervals, "
             f"but they range from {positive.min():g} to {positive.max():g} s.\n{remedy}"

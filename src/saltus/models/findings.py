@@ -5,18 +5,21 @@ from dataclasses import dataclass, fields, is_dataclass
 from itertools import combinations
 
 import numpy as np
+import numpy.typing as npt
 
+from saltus.errors import ModelError
 from saltus.models.arrays import Arrays
-from saltus.models.checks import FloatArray
+from saltus.models.checks import FloatArray, equal_intervals
 from saltus.models.coloured import ColouredSensor
 from saltus.models.dependence import TimeDependent, fixed
 from saltus.models.dynamics import LinearSDE, LinearTransition
 from saltus.models.hybrid import HybridModel
 from saltus.models.sensors import BoundSensor, LinearSensor
 
-__all__ = ["Finding", "check"]
+__all__ = ["Finding", "check", "per_interval"]
 
 _ALIKE = 1e-12  # relative difference below which two modes' matrices are equal
+_DIVIDES = 1e-6  # part of a standard deviation by which two intervals may differ from one
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +34,19 @@ class Finding:
         return f"{self.where}: {self.message}"
 
 
-def check(model: HybridModel) -> list[Finding]:
+def check(model: HybridModel, times: npt.ArrayLike | None = None) -> list[Finding]:
     """Look for what is admissible but probably not meant.
 
-    Kinds: `indistinguishable` modes, `undiscretised`, `not-continuous` and `unstable` matrices, `no-noise`,
-    `unobservable` state components, `unreachable` states. Matrices that depend on `t` are not looked at, and with a
-    nonlinear sensor nothing is said of observability, which then depends on where the object is.
+    Kinds: `indistinguishable` modes, `undiscretised`, `not-continuous` and `unstable` matrices, `per-interval` motion,
+    `no-noise`, `unobservable` state components, `unreachable` states. Matrices that depend on `t` are not looked at,
+    and with a nonlinear sensor nothing is said of observability, which then depends on where the object is.
+
+    Args:
+        model: any model.
+        times: of the measurements it is meant for, s: motion that serves equal intervals only is then named where
+            intervals differ, else always.
     """
-    found = list(_motion(model)) + list(_unreachable(model))
+    found = [*_motion(model), *per_interval(model, times), *_unreachable(model)]
     if not _depends_on_t(model):
         linear = [name for name, sensor in model.sensors.items() if isinstance(sensor, LinearSensor)]
         arrays = model.compile(dt=1.0, sensor=linear)  # any interval tells modes apart
@@ -48,9 +56,50 @@ def check(model: HybridModel) -> list[Finding]:
     return found
 
 
+def per_interval(model: HybridModel, times: npt.ArrayLike | None = None) -> list[Finding]:
+    """Say where motion over an interval is not that over its two halves.
+
+    Whether F(2h) = F(h)^2, Q(2h) = F(h) Q(h) F(h)' + Q(h) and b(2h) = F(h) b(h) + b(h), h the median interval.
+
+    Args:
+        model: any model.
+        times: of the measurements, s; with equal intervals nothing is said. None says it in any case.
+    """
+    steps = np.ones(1) if times is None else np.diff(np.asarray(times, dtype=np.float64))
+    steps = steps[steps > 0]
+    if (times is not None and equal_intervals(steps)) or _asks_for_t(model.dynamics):
+        return []
+    h = float(np.median(steps))
+    try:
+        F, Q, b = model.dynamics.step(np.array([h, 2 * h]), None)
+    except ModelError:  # a description per step refuses unequal intervals by itself
+        return []
+    twice = F[0] @ Q[0] @ F[0].swapaxes(-1, -2) + Q[0]
+    one, two = (np.sqrt(np.maximum(np.diagonal(a, axis1=-2, axis2=-1), 0.0)) for a in (Q[1], twice))
+    sd = np.where((two > 0) | (one > 0), np.maximum(one, two), 1.0)
+    off = np.abs(Q[1] - twice) / (sd[..., :, None] * sd[..., None, :])
+    moved = np.abs(F[1] - F[0] @ F[0]) / np.maximum(np.abs(F[1]), 1.0)
+    drifted = np.zeros(1) if b is None else np.abs(b[1] - (F[0] @ b[0][..., None])[..., 0] - b[0])
+    if max(off.max(), moved.max()) <= _DIVIDES and drifted.max() <= _DIVIDES * (1.0 if b is None else np.abs(b).max()):
+        return []
+    at = np.unravel_index(int(np.argmax(np.abs(one - two) / sd)), sd.shape)
+    return [
+        Finding(
+            "per-interval",
+            "dynamics",
+            f"over {2 * h:.6g} s x[{at[-1]}] is disturbed by {one[at]:.3g}, over two intervals of {h:.6g} s by "
+            f"{two[at]:.3g}: a missed measurement, or a record without values, changes the answer. Give motion that "
+            "belongs to time, constant_velocity of kind 'lasting' or a LinearSDE, or measure at equal intervals.",
+        )
+    ]
+
+
 def _depends_on_t(model: HybridModel) -> bool:
-    parts = [part for part in (model.dynamics, *model.sensors.values()) if is_dataclass(part)]
-    values = [getattr(part, f.name) for part in parts for f in fields(part)]
+    return any(_asks_for_t(part) for part in (model.dynamics, *model.sensors.values()))
+
+
+def _asks_for_t(part: object) -> bool:
+    values = [getattr(part, f.name) for f in fields(part)] if is_dataclass(part) else []
     return any(isinstance(value, TimeDependent) and "t" in value.words for value in values)
 
 

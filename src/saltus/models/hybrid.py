@@ -169,11 +169,15 @@ class HybridModel:
             first += size
         return Layout(columns, first), self.compile(times=t, sensor=present)
 
-    def check(self) -> "list[Finding]":
-        """Say what is doubtful about the model: a list of findings, empty when nothing is."""
+    def check(self, times: npt.ArrayLike | None = None) -> "list[Finding]":
+        """Say what is doubtful about the model: a list of findings, empty when nothing is.
+
+        Args:
+            times: of the measurements it is meant for, s, where they are known: see `saltus.models.findings.check`.
+        """
         from saltus.models.findings import check
 
-        return check(self)
+        return check(self, times)
 
     def _sensor(self, name: str) -> LinearSensor:
         sensor = self.sensors[name]

@@ -68,7 +68,7 @@ def _sde(model: HybridModel) -> LinearSDE:
     if not isinstance(model.dynamics, LinearSDE):
         raise ModelError(
             f"{type(model.dynamics).__name__} moves in discrete time and has no stochastic differential equation.\n"
-            "Describe the motion by LinearSDE, constant_acceleration, singer, or constant_velocity(kind='white')."
+            "Describe the motion by LinearSDE, constant_acceleration, singer, or constant_velocity of another kind."
         )
     return model.dynamics
 

@@ -18,34 +18,54 @@ from saltus.models.dependence import Matrix, fixed, is_fixed, resolve
 from saltus.models.dynamics import LinearSDE, Step
 from saltus.models.turning import turning
 
-__all__ = ["Motion", "constant_acceleration", "constant_velocity", "singer"]
+__all__ = ["ACCEL_TIME", "Motion", "constant_acceleration", "constant_velocity", "singer"]
+
+
+ACCEL_TIME = 4.0  # s, that an acceleration lasts unless a model says otherwise
 
 
 def constant_velocity(
-    dims: int, accel: Matrix, kind: Literal["scan", "white"] = "scan", *, turn: Matrix | None = None
+    dims: int,
+    accel: Matrix,
+    kind: Literal["lasting", "white", "scan"] = "lasting",
+    *,
+    accel_time: Matrix | None = None,
+    turn: Matrix | None = None,
 ) -> "Motion":
     """Constant velocity, disturbed by acceleration; state (x, vx) per axis.
 
     F = [[1, dt], [0, 1]];
-    "scan": Q = accel^2 g g', g = (dt^2/2, dt): acceleration constant within an interval, independent between them;
-    "white": Q = accel [[dt^3/3, dt^2/2], [dt^2/2, dt]]: white acceleration, consistent over divided intervals.
+    "lasting": Q = q [[dt^3/3, dt^2/2], [dt^2/2, dt]], q = accel^2 accel_time: accelerations that last a time, whatever
+    the intervals between measurements;
+    "white": the same with q = accel;
+    "scan": Q = accel^2 g g', g = (dt^2/2, dt): acceleration constant within an interval, independent between them.
+
+    The first two are consistent over divided intervals: a missed measurement, or a record without values, changes
+    nothing. "scan" is not: over an interval of k periods it adds k times the variance of velocity that k intervals add,
+    and ties velocity to position; it serves equal intervals. "lasting" adds as much to the velocity at dt = accel_time.
     With `turn`, the velocity turns besides, at a constant rate in the plane of the first two axes (`turning`).
 
     Args:
         dims: number of axes.
-        accel: for all axes or per axis (dims,), and possibly depending on chains: "scan", standard deviation in
-            m/s^2; "white", spectral density in m^2/s^3 (accel_scan^2 * scan_period matches at that period).
+        accel: for all axes or per axis (dims,), and possibly depending on chains: standard deviation in m/s^2; for
+            "white" the spectral density q in m^2/s^3.
         kind: the law of the acceleration.
+        accel_time: of "lasting": s, for all axes or per axis, possibly depending on chains; by default `ACCEL_TIME`.
         turn: rate of turn, rad/s, from the second axis towards the first: to the right where x is east and y north;
             possibly depending on chains. Then the first two axes have equal acceleration.
 
     Raises:
-        ModelError: accel is negative, or does not fit the number of axes; a turn without a plane to turn in.
+        ModelError: accel is negative, or does not fit the number of axes; a turn without a plane to turn in; a time
+            given for another kind.
 
     Source: Zhuk, Kozheshkurt and Yuzefovich (2009), horizontal and vertical models, for "scan".
     """
+    if kind == "lasting":
+        return Motion("velocity", dims, accel, ACCEL_TIME if accel_time is None else accel_time, turn)
     if kind not in ("scan", "white"):
-        raise ModelError(f"constant_velocity: kind must be 'scan' or 'white', got {kind!r}.")
+        raise ModelError(f"constant_velocity: kind must be 'lasting', 'white' or 'scan', got {kind!r}.")
+    if accel_time is not None:
+        raise ModelError(f"constant_velocity: accel_time goes with kind='lasting', not with {kind!r}.")
     return Motion("velocity-scan" if kind == "scan" else "velocity-white", dims, accel, turn=turn)
 
 
@@ -86,7 +106,7 @@ def singer(dims: int, tau: Matrix, sigma: Matrix) -> "Motion":
 class Motion:
     """One law of motion for each of `dims` axes; made by constant_velocity, constant_acceleration or singer."""
 
-    law: Literal["velocity-scan", "velocity-white", "acceleration", "singer"]
+    law: Literal["velocity", "velocity-white", "velocity-scan", "acceleration", "singer"]
     dims: int
     noise: Matrix
     tau: Matrix | None = None
@@ -115,10 +135,11 @@ class Motion:
             raise ModelError(f"a turn needs a plane: dims must be 2 or more, got {self.dims}.")
         if is_fixed(self.turn):
             object.__setattr__(self, "turn", numbers(self.turn, "turn"))
-        if is_fixed(self.noise):
-            noise = np.asarray(self.noise)
-            if noise.ndim and noise.shape[-1] > 1 and not np.array_equal(noise[..., 0], noise[..., 1]):
-                raise ModelError("accel must be equal on the first two axes, in whose plane the velocity turns.")
+        for value, word in zip((self.noise, self.tau), _LAWS[self.law].words, strict=True):
+            if value is not None and is_fixed(value):
+                level = np.asarray(value)
+                if level.ndim and level.shape[-1] > 1 and not np.array_equal(level[..., 0], level[..., 1]):
+                    raise ModelError(f"{word} must be equal on the first two axes, in whose plane the velocity turns.")
 
     def __eq__(self, other: object) -> bool:
         return same(self, other)
@@ -145,7 +166,8 @@ class Motion:
         F, Q = (_blocks(block, self.dims) for block in law.blocks(step, noise, tau))
         if self.turn is not None:
             kind: Literal["scan", "white"] = "scan" if self.law == "velocity-scan" else "white"
-            plane = turning(step[..., 0], fixed(self.turn, "turn"), noise[..., 0], kind)
+            level = _density(noise, tau) if self.law == "velocity" else noise
+            plane = turning(step[..., 0], fixed(self.turn, "turn"), level[..., 0], kind)
             F, Q = (_with_plane(block, own) for block, own in zip((F, Q), plane, strict=True))
         return Step(F, Q, None)
 
@@ -158,7 +180,7 @@ class Motion:
         if self.law == "velocity-scan":
             raise ModelError(
                 "acceleration constant within a scan is no white noise and has no stochastic differential equation.\n"
-                "Use constant_velocity(..., kind='white')."
+                "Use constant_velocity(..., kind='lasting')."
             )
         order = _LAWS[self.law].order
         noise, tau = self._parameters()
@@ -169,7 +191,7 @@ class Motion:
             F[..., -1, -1] = -1 / tau
             G[..., -1, 0] = noise * np.sqrt(2 / tau)
         else:
-            G[..., -1, 0] = np.sqrt(noise)
+            G[..., -1, 0] = np.sqrt(_density(noise, tau) if self.law == "velocity" else noise)
         drift, spread = _blocks(F, self.dims), _blocks(G, self.dims)
         if self.turn is not None:
             turn = fixed(self.turn, "turn")
@@ -214,6 +236,15 @@ def _matrix(rows: Sequence[Sequence[FloatArray | float]]) -> FloatArray:
         for j, entry in enumerate(row):
             result[..., i, j] = entry
     return result
+
+
+def _density(accel: FloatArray, accel_time: FloatArray) -> FloatArray:
+    """Spectral density of accelerations that last a time, m^2/s^3."""
+    return accel**2 * accel_time
+
+
+def _velocity(dt: FloatArray, accel: FloatArray, accel_time: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return _velocity_white(dt, _density(accel, accel_time), accel_time)
 
 
 def _velocity_scan(dt: FloatArray, accel: FloatArray, _: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -300,8 +331,9 @@ class _Law(NamedTuple):
 
 
 _LAWS = {
-    "velocity-scan": _Law(2, ("accel", ""), _velocity_scan),
+    "velocity": _Law(2, ("accel", "accel_time"), _velocity),
     "velocity-white": _Law(2, ("accel", ""), _velocity_white),
+    "velocity-scan": _Law(2, ("accel", ""), _velocity_scan),
     "acceleration": _Law(3, ("jerk", ""), _acceleration),
     "singer": _Law(3, ("sigma", "tau"), _singer),
 }

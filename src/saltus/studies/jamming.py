@@ -79,7 +79,7 @@ def described() -> HybridModel:
             Chain("radar", states, sojourn={"ok": 800.0, "jammed": 80.0, "biased": 80.0, "lost": 80.0}),
             Chain("beacon", {"ok": OK, "jammed": states["jammed"]}, sojourn={"ok": 800.0, "jammed": 80.0}),
         ],
-        dynamics=constant_velocity(2, accel=lambda manoeuvre: manoeuvre),
+        dynamics=constant_velocity(2, accel=lambda manoeuvre: manoeuvre, kind="scan"),
         sensors={
             "radar": FaultySensor(PositionSensor(2, _SIGMA[0]), ["radar"]),
             "beacon": FaultySensor(PositionSensor(2, _SIGMA[1]), ["beacon"]),
