@@ -8,6 +8,7 @@ from typing import Literal
 import click
 
 from saltus.errors import SaltusError
+from saltus.text import say
 
 __all__ = ["main"]
 
@@ -29,14 +30,14 @@ class _Group(click.Group):
         try:
             return super().invoke(ctx)
         except SaltusError as error:
-            click.echo(f"saltus: {error}", err=True)
+            say(f"saltus: {error}", err=True)
             sys.exit(2)
         except BrokenPipeError:
             # Whoever read the output has closed it, as head does. Commands write their files before they say so.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(0)
         except OSError as error:
-            click.echo(f"saltus: {_said(error)}", err=True)
+            say(f"saltus: {_said(error)}", err=True)
             sys.exit(2)
         except KeyboardInterrupt:
             click.echo("saltus: interrupted; nothing half-written was left", err=True)
@@ -155,7 +156,7 @@ def study(
 
         with progress_bar() as bar:
             run_study(name, output, runs, seed, progress=lambda done, all_runs: bar.working(name, done / all_runs))
-    click.echo(f"written to {output}/")
+    say(f"written to {output}/")
 
 
 @main.command()

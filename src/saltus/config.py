@@ -31,16 +31,18 @@ system = "platform"               # optional: sources of one system make common 
 import dataclasses
 import datetime
 import difflib
-import tomllib
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, TypeVar, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from saltus.errors import ModelError
 from saltus.io.layout import categories
 from saltus.records import System
+from saltus.text import brief, cut, shown
+from saltus.toml import load_toml
 from saltus.tracks.registration import RegistrationSettings
 from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
 
@@ -72,6 +74,9 @@ _Octet = Annotated[int, Field(ge=0, le=255)]
 _Sigma = Annotated[float, Field(gt=0.0, le=1e4)]
 
 
+_Name = Annotated[str, AfterValidator(shown)]  # as a source's is when it is read
+
+
 class SensorConfig(BaseModel):
     """A sensor's site and noise; angles in degrees, lengths in m."""
 
@@ -83,7 +88,7 @@ class SensorConfig(BaseModel):
     sic: _Octet | None = None
     height: Annotated[float, Field(ge=-450.0, le=9000.0)] | None = None
     category: Annotated[int, Field(ge=1, le=255)] | None = None
-    name: str = ""
+    name: _Name = ""
     sigma_range: _Sigma | None = None
     sigma_azimuth: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     sigma_xy: _Sigma | None = None
@@ -91,7 +96,7 @@ class SensorConfig(BaseModel):
     sigma_time: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
     period: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
     correlation_time: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
-    system: str = ""
+    system: _Name = ""
 
     @model_validator(mode="after")
     def _identified(self) -> "SensorConfig":
@@ -137,11 +142,7 @@ def load_config(path: Path | str | None) -> Config:
     """
     if path is None:
         return Config()
-    try:
-        with Path(path).open("rb") as file:
-            content = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ModelError(f"{path}: no readable TOML: {error}.") from error
+    content = load_toml(path)
     _known(path, "", content, Config.model_fields)
     values: dict[str, object] = {
         "tracker": _settings(path, "tracker", content.get("tracker", {}), TrackerSettings),
@@ -182,7 +183,7 @@ def _date(path: Path | str, value: object) -> datetime.date:
             return parse_date(value)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
-    raise ModelError(f"{path}: date = {value}: write {_HINTS['date']}.")
+    raise ModelError(f"{path}: date = {brief(value)}: write {_HINTS['date']}.")
 
 
 def _sensors(path: Path | str, tables: object) -> tuple[SensorConfig, ...]:
@@ -226,19 +227,21 @@ def _first(error: ValidationError) -> str:
     said = finding["msg"].removeprefix("Value error, ")
     if not key:
         return f"{said}."
-    return f"{key} = {finding['input']!r}: {said[0].lower()}{said[1:]}. Give {_HINTS.get(key, 'another value')}."
+    return f"{key} = {brief(finding['input'])}: {said[0].lower()}{said[1:]}. Give {_HINTS.get(key, 'another value')}."
 
 
 def _editions(path: Path | str, table: object) -> dict[int, str]:
     if not isinstance(table, Mapping):
-        raise ModelError(f"{path}: editions = {table!r}: make it a table [editions] of {_HINTS['editions']}.")
+        raise ModelError(f"{path}: editions = {brief(table)}: make it a table [editions] of {_HINTS['editions']}.")
     editions = {}
     for key, value in table.items():
-        if not str(key).isdigit() or not 1 <= int(key) <= 255 or not isinstance(value, str):
-            raise ModelError(f"{path}: [editions] {key} = {value!r}: write {_HINTS['editions']}.")
+        if not re.fullmatch("[0-9]{1,3}", key) or not 1 <= int(key) <= 255 or not isinstance(value, str):
+            raise ModelError(f"{path}: [editions] {cut(key)} = {brief(value)}: write {_HINTS['editions']}.")
         known = categories().get(int(key), {value: None})
         if value not in known:
-            raise ModelError(f"{path}: [editions] {key} = {value!r}: not known; choose one of {', '.join(known)}.")
+            raise ModelError(
+                f"{path}: [editions] {cut(key)} = {brief(value)}: not known; choose one of {', '.join(known)}."
+            )
         editions[int(key)] = value
     return editions
 
@@ -246,7 +249,7 @@ def _editions(path: Path | str, table: object) -> dict[int, str]:
 def _settings(path: Path | str, name: str, table: object, kind: type[T]) -> T:
     """Make settings from a table, each value checked against the type of its field."""
     if not isinstance(table, Mapping):
-        raise ModelError(f"{path}: {name} = {table!r}: make it a table [{name}].")
+        raise ModelError(f"{path}: {name} = {brief(table)}: make it a table [{name}].")
     fields = [f.name for f in dataclasses.fields(kind)]
     _known(path, f"[{name}]", table, fields)
     types = get_type_hints(kind)
@@ -256,11 +259,17 @@ def _settings(path: Path | str, name: str, table: object, kind: type[T]) -> T:
             values[key] = TypeAdapter(types[key]).validate_python(_tuples(value), strict=True)
         except ValidationError as error:
             said = error.errors(include_url=False)[0]["msg"]
-            raise ModelError(f"{path}: [{name}] {key} = {value!r}: {said[0].lower()}{said[1:]}.") from error
+            raise ModelError(f"{path}: [{name}] {key} = {brief(value)}: {said[0].lower()}{said[1:]}.") from error
+        if _holds_nan(values[key]):
+            raise ModelError(f"{path}: [{name}] {key} = {brief(value)}: nan is no value.")
     try:
         return kind(**values)
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from error
+
+
+def _holds_nan(value: object) -> bool:
+    return any(map(_holds_nan, value)) if isinstance(value, tuple) else value != value
 
 
 def _tuples(value: object) -> object:
@@ -270,14 +279,14 @@ def _tuples(value: object) -> object:
 def _known(path: Path | str, where: str, table: object, known: Iterable[str]) -> None:
     """Refuse keys that mean nothing here: a misspelt one would be obeyed in silence."""
     if not isinstance(table, Mapping):
-        raise ModelError(f"{path}: {where}: a table of keys is expected, not {table!r}.")
+        raise ModelError(f"{path}: {where}: a table of keys is expected, not {brief(table)}.")
     names = list(known)
     for key in table:
         if key not in names:
             near = difflib.get_close_matches(key, names, n=2) or names
             place = f"{where}: " if where else ""
             raise ModelError(
-                f"{path}: {place}unknown key {key!r}. Did you mean {' or '.join(near)}?"
+                f"{path}: {place}unknown key {brief(key)}. Did you mean {' or '.join(near)}?"
                 if near is not names
-                else f"{path}: {place}unknown key {key!r}. Known are: {', '.join(names)}."
+                else f"{path}: {place}unknown key {brief(key)}. Known are: {', '.join(names)}."
             )

@@ -17,6 +17,7 @@ from saltus.io import read_part
 from saltus.io.merge import merge
 from saltus.io.part import Part
 from saltus.records import Contents, Recording
+from saltus.text import shown
 
 __all__ = ["show_info"]
 
@@ -60,7 +61,7 @@ def show_info(inputs: Sequence[Path], config_path: Path | None, date: str | None
 
 def _show(console: Console, recording: Recording, config: Config) -> None:
     for file, lines in groupby(recording.contents, key=lambda c: c.file):
-        console.print(Text(file, style="bold"))
+        console.print(Text(shown(file), style="bold"))
         for line in lines:
             console.print(Padding(_system(line, config), (0, 0, 1, 2)))
     plots = recording.plots
@@ -69,7 +70,7 @@ def _show(console: Console, recording: Recording, config: Config) -> None:
     if recording.tracks is not None:
         console.print(f"{recording.tracks.num_rows} reports are another system's tracks: kept apart, never plots")
     for problem in recording.problems:
-        console.print(Text("problem: ", style="yellow") + Text(problem))
+        console.print(Text("problem: ", style="yellow") + Text(shown(problem)))
 
 
 def _system(line: Contents, config: Config) -> Table:

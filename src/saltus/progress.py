@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from saltus.text import shown
+
 if TYPE_CHECKING:
     import rich.progress
 
@@ -28,7 +30,9 @@ class Progress:
         if self._display is None:
             return
         if stage not in self._tasks:
-            self._tasks[stage] = self._display.add_task(stage, total=1.0)
+            from rich.markup import escape
+
+            self._tasks[stage] = self._display.add_task(escape(shown(stage)), total=1.0)
         self._display.update(self._tasks[stage], completed=share)
 
 

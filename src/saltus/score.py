@@ -4,7 +4,6 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
-import click
 import numpy as np
 import numpy.typing as npt
 
@@ -13,6 +12,7 @@ from saltus.evaluate import Reference, Tracks, target_scores
 from saltus.evaluate.tables import read_reference, read_tracks
 from saltus.geo import ecef_to_geodetic
 from saltus.io.write import output_file
+from saltus.text import say
 
 __all__ = ["score_files"]
 
@@ -81,10 +81,10 @@ def _show(figures: dict[str, object]) -> None:
     """Print the figures of all targets and of each, one column each."""
     targets = figures["targets"]
     columns = {"all targets": figures, **(targets if isinstance(targets, dict) else {})}
-    click.echo(f"{'':<22}" + "".join(f"{name:>14}" for name in columns))
+    say(f"{'':<22}" + "".join(f"{name:>14}" for name in columns))
     for key, value in figures.items():
         if not isinstance(value, dict):
-            click.echo(f"{key:<22}" + "".join(f"{_text(row.get(key, '')):>14}" for row in columns.values()))
+            say(f"{key:<22}" + "".join(f"{_text(row.get(key, '')):>14}" for row in columns.values()))
 
 
 def _text(value: object) -> str:

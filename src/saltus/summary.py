@@ -6,13 +6,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import click
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots
+from saltus.text import say
 from saltus.tracks.health import Health, sensor_health
 from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
@@ -233,9 +233,9 @@ def _or(value: float | None, otherwise: str) -> str:
 def show_summary(summary: dict[str, Any], output: Path, report: bool, systems: Sequence[str] = ()) -> None:
     """Say on the screen what was done and where it lies; `systems`: lines on several systems."""
     reports, tracks = summary["reports"], summary["tracks"]
-    click.echo(f"{reports['read']} reports read, {reports['used']} on {tracks['confirmed']} confirmed tracks")
+    say(f"{reports['read']} reports read, {reports['used']} on {tracks['confirmed']} confirmed tracks")
     for reason, count in summary["reasons"].items():
-        click.echo(f"  {count:>8} {reason}")
+        say(f"  {count:>8} {reason}")
     for name, row in summary["noise"].items():
         if row["nis_mean"] is None and not any(row[label]["estimated"] for label in row if label.startswith("sigma")):
             continue  # no plots, or too few to say anything
@@ -245,18 +245,18 @@ def show_summary(summary: dict[str, Any], output: Path, report: bool, systems: S
             for label in row
             if label.startswith("sigma")
         )
-        click.echo(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (expected 2)")
+        say(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (expected 2)")
     for name, row in summary["faults"].items():
         if row["judged_plots"]:
-            click.echo(_said_of_faults(name, row))
+            say(_said_of_faults(name, row))
     for line in systems:
-        click.echo(line)
+        say(line)
     for problem in summary["problems"]:
-        click.echo(f"note: {problem}", err=True)
+        say(f"note: {problem}", err=True)
     seconds = summary["seconds"]
-    click.echo(f"decoding {seconds['decoding']} s, tracking {seconds['tracking']} s; written to {output}/")
+    say(f"decoding {seconds['decoding']} s, tracking {seconds['tracking']} s; written to {output}/")
     if report:
-        click.echo(f"open {output / 'report.html'}")
+        say(f"open {output / 'report.html'}")
 
 
 def _said_of_faults(name: str, row: dict[str, Any]) -> str:

@@ -177,6 +177,11 @@ sd = [1.0, 1.0]
 """
 
 
+MANY_CHAINS = "".join(
+    f'[[chain]]\nname = "c{k}"\nstates = {[str(i) for i in range(10)]}\nstay = 0.9\n' for k in range(9)
+)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -203,6 +208,10 @@ sd = [1.0, 1.0]
         ("sd = [1.0, 1.0]", "sd = [1.0, 1.0, 1.0]", "dimension"),
         ("[prior]", "steps = 1\n[prior]", "unknown key 'steps'"),
         ("[[chain]]", "[[chain", "no readable TOML"),
+        ("dims = 1\n", "dims = 1_000_000_000\n", r"\[dynamics\]: dims must be .* got 1000000000"),
+        ("dims = 1\nsigma", "dims = 1_000_000_000\nsigma", r"\[sensor.radar\]: dims must be"),
+        ("dims = 1\n", "dims = true\n", r"\[dynamics\]: dims must be .* got True"),
+        ("stay = 0.9\n", "stay = 0.9\n" + MANY_CHAINS, "chains have 2 x 10 x 10 .* joint states"),
         ("[prior]", "[judge]\nplace = [4]\n[prior]", "judge 'place' names the states"),
     ],
 )

@@ -4,7 +4,6 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import click
 import numpy as np
 
 from saltus.config import load_config, parse_date
@@ -13,6 +12,7 @@ from saltus.diagnose.fit import NoiseFit, Parameter, fit_noise
 from saltus.diagnose.residuals import Phase, Residuals, from_recordings, from_table
 from saltus.errors import DataError
 from saltus.io.write import output_directory
+from saltus.text import say
 
 __all__ = ["diagnose_noise"]
 
@@ -88,24 +88,22 @@ def _tree(fit: NoiseFit) -> dict[str, object]:
 def _show(found: Residuals, fits: dict[str, NoiseFit], output: Path) -> None:
     unit = f" {found.unit}" if found.unit else ""
     for name, fit in fits.items():
-        click.echo(
+        say(
             f"{name}: {fit.n_values} values of {fit.n_series} series every {fit.interval:.3g} s "
             f"({fit.n_outliers} outliers left out)"
         )
-        click.echo(f"  correlation time {_said(fit.tau)} s, coloured part {_said(fit.sigma)}{unit}")
-        click.echo(
-            f"  white part {_said(fit.white)}{unit}" + ("" if np.isnan(fit.bias) else f", bias {fit.bias:.4g}{unit}")
-        )
-        click.echo(
+        say(f"  correlation time {_said(fit.tau)} s, coloured part {_said(fit.sigma)}{unit}")
+        say(f"  white part {_said(fit.white)}{unit}" + ("" if np.isnan(fit.bias) else f", bias {fit.bias:.4g}{unit}"))
+        say(
             f"  {fit.verdict}; log-likelihood {fit.gain:.1f} above white noise; "
             f"successive innovations correlate {fit.lag1_white:+.2f} as white, {fit.lag1_coloured:+.2f} as coloured"
         )
         if np.isfinite(fit.overconfidence):
-            click.echo(f"  the mean of 10 errors varies {fit.overconfidence:.1f} times as much as white noise promises")
-        click.echo(f"  suggested noise: {fit.suggestion()}")
+            say(f"  the mean of 10 errors varies {fit.overconfidence:.1f} times as much as white noise promises")
+        say(f"  suggested noise: {fit.suggestion()}")
         if fit.verdict != "unexplained":
-            click.echo(f"  {_meaning(fit, found.unit)}")
-    click.echo(f"written to {output}/")
+            say(f"  {_meaning(fit, found.unit)}")
+    say(f"written to {output}/")
 
 
 def _meaning(fit: NoiseFit, unit: str) -> str:

@@ -4,12 +4,11 @@ import json
 import math
 from pathlib import Path
 
-import click
-
 from saltus.gap.compare import optimality_gap
 from saltus.gap.model_file import load_scenario
 from saltus.io.write import output_file
 from saltus.progress import progress_bar
+from saltus.text import say
 
 __all__ = ["show_gap"]
 
@@ -45,7 +44,7 @@ def show_gap(
     if output is not None:
         with output_file(output) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8")
-    click.echo(text if as_json else "\n".join(gap.lines()))
+    say(text if as_json else "\n".join(gap.lines()))
 
 
 def _clean(tree: dict[str, object]) -> dict[str, object]:

@@ -36,7 +36,6 @@ position = [0, 2]
 
 import difflib
 import re
-import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -61,6 +60,8 @@ from saltus.models import (
     singer,
 )
 from saltus.models.checks import FloatArray, numbers
+from saltus.text import brief
+from saltus.toml import load_toml
 
 __all__ = ["Scenario", "load_scenario"]
 
@@ -92,6 +93,7 @@ _SECTIONS = {
 }
 _OF_CHAINS = "trans|stay|sojourn|rates|per|initial"
 _ORDERS = {"constant_velocity": ("position", "velocity")}
+_MOST_STEPS = 100_000  # of one run: longer runs tell no more about a filter
 _THREE = ("position", "velocity", "acceleration")
 
 
@@ -114,9 +116,10 @@ class Scenario:
     title: str = ""
 
     def __post_init__(self) -> None:
-        if not self.interval > 0 or self.steps < 2:
+        if not 0 < self.interval < np.inf or not 2 <= self.steps <= _MOST_STEPS:
             raise ModelError(
-                f"interval must be positive seconds and steps at least 2, got {self.interval}, {self.steps}."
+                f"interval must be positive seconds and steps from 2 to {_MOST_STEPS}, "
+                f"got {self.interval}, {self.steps}."
             )
         for name, at in self.judge.items():
             if not at or any(not 0 <= i < self.model.n_state for i in at):
@@ -132,11 +135,7 @@ def load_scenario(path: Path | str) -> Scenario:
         ModelError: the file is no TOML, a key is unknown or missing, or the model cannot be; the message names file
             and key.
     """
-    try:
-        with Path(path).open("rb") as file:
-            content = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ModelError(f"{path}: no readable TOML: {error}.") from error
+    content = load_toml(path)
     try:
         return _scenario(content)
     except (SaltusError, TypeError, ValueError) as error:
@@ -197,7 +196,7 @@ def _made(
 ) -> Any:
     kind = table.pop("kind", None)
     if kind not in kinds:
-        raise ModelError(f"{where}: kind = {kind!r}: give one of {', '.join(kinds)}.")
+        raise ModelError(f"{where}: kind = {brief(kind)}: give one of {', '.join(kinds)}.")
     build, needed, further = kinds[kind]
     values = {
         name: tuple(value) if name in ("axes", "velocities") else value
@@ -219,7 +218,7 @@ def _prior(value: object) -> Gaussian:
 def _deviations(value: object) -> FloatArray:
     sd = numbers(value, "[prior]: sd")
     if sd.ndim != 1 or sd.min(initial=0.0) < 0:
-        raise ModelError(f"[prior]: sd = {value!r}: give standard deviations, one per state, none negative.")
+        raise ModelError(f"[prior]: sd = {brief(value)}: give standard deviations, one per state, none negative.")
     return sd
 
 
@@ -227,13 +226,13 @@ def _table(
     value: object, where: str, needed: Iterable[str] = (), known: Iterable[str] | None = None
 ) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise ModelError(f"{where} must be a table of keys, got {value!r}.")
+        raise ModelError(f"{where} must be a table of keys, got {brief(value)}.")
     names = None if known is None else list(known)
     for key in value:
         if names is not None and key not in names:
             near = difflib.get_close_matches(key, names, n=1)
             hint = f"Did you mean {near[0]}?" if near else f"Known are: {', '.join(names)}."
-            raise ModelError(f"{where}: unknown key {key!r}. {hint}")
+            raise ModelError(f"{where}: unknown key {brief(key)}. {hint}")
     for key in needed:
         if key not in value:
             raise ModelError(f"{where}: the key {key!r} is missing.")
@@ -242,11 +241,11 @@ def _table(
 
 def _list(value: object, what: str) -> list[Any]:
     if not isinstance(value, list):
-        raise ModelError(f"{what} must be a list, got {value!r}.")
+        raise ModelError(f"{what} must be a list, got {brief(value)}.")
     return value
 
 
 def _number(value: object, what: str, meaning: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ModelError(f"{what} = {value!r}: give {meaning}.")
+        raise ModelError(f"{what} = {brief(value)}: give {meaning}.")
     return float(value)

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import click
 import numpy as np
 import numpy.typing as npt
 
@@ -23,6 +22,7 @@ from saltus.progress import progress_bar
 from saltus.records import Kind, Recording
 from saltus.run import track_recording
 from saltus.simulate.scene import demo_aircraft
+from saltus.text import say
 
 __all__ = ["study_faults"]
 
@@ -139,25 +139,25 @@ def _show(metrics: dict[str, object]) -> None:
     """Print the table."""
     figures, grown, p = metrics["figures"], metrics["growth"], metrics["p_fault"]
     assert isinstance(figures, dict) and isinstance(grown, dict) and isinstance(p, dict)
-    click.echo(f"reference: {metrics['reference']}")
-    click.echo(f"{'':32}{'clean':>9}{'faulty':>9}{'growth':>9}{'without chains':>16}{'growth':>9}")
+    say(f"reference: {metrics['reference']}")
+    say(f"{'':32}{'clean':>9}{'faulty':>9}{'growth':>9}{'without chains':>16}{'growth':>9}")
     for name in ("plots_straight", "plots_turn"):
         counts = [figures[run][name] for run in ("clean_with", "injected_with", "injected_without")]
-        click.echo(f"{name:32}{counts[0]:9.0f}{counts[1]:9.0f}{'':9}{counts[2]:16.0f}")
+        say(f"{name:32}{counts[0]:9.0f}{counts[1]:9.0f}{'':9}{counts[2]:16.0f}")
     for name in grown["with"]:
         values = [figures[run][name] for run in ("clean_with", "injected_with", "injected_without")]
         more = [grown[chains][name] for chains in ("with", "without")]
         a, b, c = ("–" if v is None else f"{v:.3f}" for v in values)
         x, y = ("–" if v is None else f"{v:+.0%}" for v in more)
-        click.echo(f"{name:32}{a:>9}{b:>9}{x:>9}{c:>16}{y:>9}")
+        say(f"{name:32}{a:>9}{b:>9}{x:>9}{c:>16}{y:>9}")
     for name, row in p.items():
         if isinstance(row, list):
-            click.echo(f"{name}: {', '.join(row) or 'none'}")
+            say(f"{name}: {', '.join(row) or 'none'}")
             continue
         value = "–" if row["value"] is None else f"{row['value']:.2%}"
-        click.echo(f"{name:32}{value:>9} of {row['plots']:.0f} plots")
+        say(f"{name:32}{value:>9} of {row['plots']:.0f} plots")
     for line in _explained(metrics["reference"] == OWN_RUN, figures["clean_with"], p):
-        click.echo(line)
+        say(line)
 
 
 def _explained(own: bool, clean: Mapping[str, float | None], p: Mapping[str, object]) -> list[str]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from saltus.errors import DataError
 from saltus.io.capture import CAPTURE_MAGIC
 from saltus.io.merge import merge
-from saltus.io.part import Part
+from saltus.io.part import Part, printable
 from saltus.records import Recording
 
 __all__ = ["FORMATS", "Format", "read", "read_part"]
@@ -88,7 +88,7 @@ def read_part(
     progress: Progress | None = None,
 ) -> Part:
     """Read one file of those that `saltus.io.merge.merge` joins; arguments and errors are those of `read`."""
-    return _format_of(path).reader(path, date, editions or {}, progress)
+    return printable(_format_of(path).reader(path, date, editions or {}, progress))
 
 
 def _format_of(path: Path) -> Format:

@@ -8,9 +8,10 @@ import numpy.typing as npt
 import pyarrow as pa
 from jaxtyping import Int
 
-from saltus.records import Contents, Kind, Plots, Traits
+from saltus.records import Contents, Kind, Plots, System, Traits
+from saltus.text import shown
 
-__all__ = ["Part", "revisit", "rotating", "scan_period"]
+__all__ = ["Part", "printable", "revisit", "rotating", "scan_period"]
 
 _FEW = 5  # intervals that make a median
 _NEARLY, _MOSTLY = 0.2, 0.8  # this share of the intervals lies within that of their median: one report a scan
@@ -32,6 +33,30 @@ class Part(NamedTuple):
 def rotating(traits: Traits, kind: npt.NDArray[np.integer]) -> Traits:
     """Return the traits of a source with reports of these kinds: what measures range and azimuth turns round."""
     return replace(traits, rotating=bool((kind == Kind.POLAR).any()))
+
+
+def printable(part: Part) -> Part:
+    """Spell the names of files and sources and what is said of them so that they only show (`saltus.text.shown`)."""
+
+    def system(of: System) -> System:
+        return replace(of, name=shown(of.name))
+
+    plots = replace(
+        part.plots,
+        sources=tuple(replace(s, system=system(s.system)) for s in part.plots.sources),
+        files=tuple(shown(name) for name in part.plots.files),
+    )
+    lines = tuple(
+        replace(
+            line,
+            file=shown(line.file),
+            system=system(line.system),
+            fields={shown(name): count for name, count in line.fields.items()},
+            notes=tuple(shown(note) for note in line.notes),
+        )
+        for line in part.contents
+    )
+    return part._replace(plots=plots, contents=lines, problems=tuple(shown(told) for told in part.problems))
 
 
 def revisit(time: npt.ArrayLike, *identities: Int[np.ndarray, " n"]) -> float:

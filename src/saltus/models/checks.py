@@ -8,11 +8,23 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.errors import ModelError
+from saltus.text import brief
 
-__all__ = ["FloatArray", "covariance", "equal_intervals", "intervals", "numbers", "probability", "same", "unit_steps"]
+__all__ = [
+    "FloatArray",
+    "axes",
+    "covariance",
+    "equal_intervals",
+    "intervals",
+    "numbers",
+    "probability",
+    "same",
+    "unit_steps",
+]
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
+_MOST_AXES = 1000  # matrices of the state beyond it outgrow any memory
 _EQUAL_INTERVALS = 1e-3  # relative: clocks are quantised, a step is still a step
 
 
@@ -29,7 +41,7 @@ def numbers(value: object, what: str) -> FloatArray:
         told = f": {', '.join(map(str, rows))}" if len(set(rows)) > 1 else ""
         raise ModelError(f"{what} is not an array: its rows differ in length{told}.") from None
     if array.dtype.kind not in "biuf":
-        raise ModelError(f"{what} must be real numbers, got {value!r}.")
+        raise ModelError(f"{what} must be real numbers, got {brief(value)}.")
     array = array.astype(np.float64)
     bad = np.argwhere(~np.isfinite(array))
     if len(bad):
@@ -38,6 +50,16 @@ def numbers(value: object, what: str) -> FloatArray:
         raise ModelError(f"{what} holds {array[index]}{where}; give a finite number.")
     array.flags.writeable = False
     return array
+
+
+def axes(kind: str, dims: object) -> None:
+    """Refuse what is no number of axes or components, and one whose matrices no memory holds.
+
+    Raises:
+        ModelError: `dims` is no whole number from 1 to 1000.
+    """
+    if not isinstance(dims, int) or isinstance(dims, bool) or not 1 <= dims <= _MOST_AXES:
+        raise ModelError(f"dims must be a positive whole number of {kind}, got {brief(dims)}; at most {_MOST_AXES}.")
 
 
 def covariance(value: object, what: str) -> FloatArray:

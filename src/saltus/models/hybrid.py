@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["HybridModel"]
 
+_MOST_CHAINS, _MOST_MODES = 24, 100_000  # each joint mode carries matrices; arrays have one axis for each chain
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HybridModel:
@@ -55,6 +57,12 @@ class HybridModel:
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ModelError(f"two chains are called {twice[0]!r}; give each its own name.")
+        if prod(len(chain) for chain in chains) > _MOST_MODES or len(chains) > _MOST_CHAINS:
+            sizes = " x ".join(str(len(chain)) for chain in chains[:8]) + (" x ..." if len(chains) > 8 else "")
+            raise ModelError(
+                f"the chains have {sizes} joint states: at most {_MOST_CHAINS} chains and {_MOST_MODES} joint states "
+                "can be computed. Leave chains out, or join those that always jump together."
+            )
         if not self.sensors:
             raise ModelError("a model needs at least one sensor: sensors={'radar': PositionSensor(...)}.")
         put(self, "chains", chains)

@@ -13,7 +13,7 @@ import numpy as np
 
 from saltus.errors import ModelError
 from saltus.models.chain import Chain
-from saltus.models.checks import FloatArray, intervals, numbers, same
+from saltus.models.checks import FloatArray, axes, intervals, numbers, same
 from saltus.models.dependence import Matrix, fixed, is_fixed, resolve
 from saltus.models.dynamics import LinearSDE, Step
 from saltus.models.turning import turning
@@ -113,8 +113,7 @@ class Motion:
     turn: Matrix | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.dims, int) or self.dims < 1:
-            raise ModelError(f"dims must be a positive whole number of axes, got {self.dims!r}.")
+        axes("axes", self.dims)
         words = _LAWS[self.law].words
         for field, word in (("noise", words[0]), ("tau", words[1])):
             value = getattr(self, field)

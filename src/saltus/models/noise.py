@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.chain import Chain
-from saltus.models.checks import FloatArray, covariance, numbers, same
+from saltus.models.checks import FloatArray, axes, covariance, numbers, same
 from saltus.models.dependence import Matrix, fixed, is_fixed, resolve
 
 __all__ = ["GaussMarkov", "MarkovNoise", "first_order", "second_order", "stationary_covariance"]
@@ -102,8 +102,7 @@ class GaussMarkov:
     white: Matrix | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.dims, int) or self.dims < 1:
-            raise ModelError(f"dims must be a positive whole number of components, got {self.dims!r}.")
+        axes("components", self.dims)
         if not self.damping > 0:
             raise ModelError(f"damping must be positive, got {self.damping!r}.")
         for name in ("tau", "sigma"):

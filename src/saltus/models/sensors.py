@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.chain import Chain
-from saltus.models.checks import FloatArray, covariance, numbers, probability, same
+from saltus.models.checks import FloatArray, axes, covariance, numbers, probability, same
 from saltus.models.dependence import Matrix, TimeDependent, fixed, is_fixed, resolve
 from saltus.models.observer import Observer
 
@@ -182,8 +182,7 @@ class PositionSensor:
 
     def __post_init__(self) -> None:
         probability(self.prob_detection, "prob_detection")
-        if not isinstance(self.dims, int) or self.dims < 1:
-            raise ModelError(f"dims must be a positive whole number of axes, got {self.dims!r}.")
+        axes("axes", self.dims)
         if is_fixed(self.sigma):
             object.__setattr__(self, "sigma", self._positive(numbers(self.sigma, "PositionSensor sigma")))
 

@@ -151,6 +151,8 @@ class TrackerSettings:
         given = {name: getattr(self, name) for name in (*positive, *outliers)}
         given["height_prior[1]"] = self.height_prior[1]
         given |= {f"degraded_sojourn[{k}]": stay for k, stay in enumerate(self.degraded_sojourn)}
+        if not np.isfinite(self.height_prior[0]):
+            raise ModelError(f"tracker.height_prior[0] is a height in m, got {self.height_prior[0]}.")
         if self.clutter_density is not None:
             given["clutter_density"] = self.clutter_density
         for name, value in given.items():
