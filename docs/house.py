@@ -31,6 +31,8 @@ WORDS = {
     "geo": "the ellipsoid",
     "linalg": "small matrix algebra",
     "progress": "a bar",
+    "text": "names fit to be read",
+    "toml": "TOML files as tables",
     "compiled": "the compiled twins, where built",
     "errors": "ModelError, DataError, NumericalError",
 }
