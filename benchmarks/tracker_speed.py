@@ -20,6 +20,7 @@ from saltus.run import track_files
 from saltus.simulate import Leg, Radar, Trajectory, observe
 from saltus.tracks.measurements import Measurements, Noise, place_plots
 from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.sources import learn_setup
 from saltus.tracks.tracker import Tracker
 
 _REPEATS, _SECONDS = 3, 600.0
@@ -78,9 +79,9 @@ def scene(rng: np.random.Generator, aircraft: int) -> Measurements:
 
 def tracked(m: Measurements) -> float:
     """Seconds of processor time of one run of the tracker."""
-    tracker = Tracker(TrackerSettings(), FilterSettings(), _PERIODS, use_identity=False)
+    tracker = Tracker(TrackerSettings(), FilterSettings(), learn_setup(m, _PERIODS), use_identity=False)
     began = time.process_time()
-    tracker.run(m, lambda rows: None)
+    tracker.feed(m, last=True)
     return time.process_time() - began
 
 

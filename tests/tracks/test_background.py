@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 from tracking_scenes import measured, run
 
-from saltus.tracks.background import background
+from saltus.tracks.background import densities, learn_background
 
 CELL, LAYER = 500.0, 50.0
+
+
+def background(m, periods):
+    """The densities at measurements, looked up in maps made of themselves."""
+    polar = [bool(np.isfinite(m.ray[m.source == s]).all()) for s in range(len(periods))]
+    return densities(m, [learn_background(m, s, float(p), polar=polar[s]) for s, p in enumerate(periods)])
 
 
 def counted(m, source, share, period):

@@ -107,7 +107,7 @@ def test_rows_are_recycled_and_ids_are_not(rng):
             born(life, [row])
             rows_used.add(row)
             seen.append(int(life.id[row]))
-            assert (life.icao24[row], life.mode3a[row], life.named[row]) == (-1, -1, -1)
+            assert (life.icao24[row], life.mode3a[row], life.callsign[row]) == (-1, -1, "")
             assert (life.coasted[row], life.has_altitude[row], life.status[row]) == (0, False, SEED)
     assert len(set(seen)) == len(seen) > len(rows_used)
     assert min(seen) >= 1

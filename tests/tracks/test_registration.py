@@ -263,7 +263,7 @@ def measurements(time, position, ray, azimuth):
     return Measurements(
         plot=np.arange(n), time=time, source=np.zeros(n, np.int32),
         position=np.column_stack([position, np.zeros(n)]), cov=np.broadcast_to(np.eye(3), (n, 3, 3)).copy(),
-        icao24=codes, mode3a=codes.astype(np.int16), named=np.zeros(n, bool),
+        icao24=codes, mode3a=codes.astype(np.int16), callsign=np.full(n, "", "U8"),
         polar=np.column_stack([np.hypot(*ray.T), azimuth]), ray=ray, lever=np.zeros((n, 2)),
         origin=np.full((n, 2), np.nan), bearing=blank, sigma_bearing=blank, jitter=np.zeros(n),
         inflation=np.ones(n),

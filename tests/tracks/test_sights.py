@@ -4,16 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tracking_scenes import fed, tracker_of
 
 from saltus.geo import Plane
 from saltus.records import Kind, Plots, Source, System
 from saltus.tracks.kinematics import Start, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Noise, place_plots
-from saltus.tracks.rows import join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.sights import sight
-from saltus.tracks.tracker import Tracker
 
 LATITUDE, LONGITUDE = np.radians([63.4, 10.4])
 PLANE = Plane(float(LATITUDE), float(LONGITUDE))
@@ -165,10 +164,7 @@ def scene(rng, *, until=60.0, radar_until=None, camera=True, clutter=0):
 
 
 def tracked(m):
-    rows = []
-    tracker = Tracker(SETTINGS, ONE_MODE, [1.0, 1.0], use_identity=False)
-    found = tracker.run(m, rows.append)
-    return join_rows(rows), found
+    return fed(tracker_of(m, settings=SETTINGS, filters=ONE_MODE, periods=[1.0, 1.0], identity=False), m)
 
 
 def test_bearings_alone_start_nothing(rng):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tracking_scenes import measured, run
 
-from saltus.tracks.slices import rounds, slices
+from saltus.tracks.slices import rounds, slice_width, slices
 
 SPEED = 100.0
 
@@ -49,13 +49,22 @@ def test_addresses_alone_are_counted_like_pairs(rng):
 
 
 def test_slices_cover_time_in_order(rng):
-    m = measured(rng.uniform(0.0, 50.0, 200), rng.normal(size=(200, 2)), 1.0, source=rng.integers(0, 2, 200))
-    for part, longest in ((m, 0.4 * 1.5), (m.take(np.flatnonzero(m.source == 1)), 4.0)):
-        cut = list(slices(part, np.array([1.5, 2.0])))
+    time = np.sort(rng.uniform(0.0, 50.0, 200))
+    for width in (0.6, 4.0):
+        cut = list(slices(time, width, last=True))
         assert [a for a, _ in cut] == [0, *(b for _, b in cut[:-1])]
-        assert cut[-1][1] == len(part)
-        assert all(part.time[b - 1] - part.time[a] <= longest for a, b in cut)
-    assert list(slices(m.take(np.zeros(0, int)), np.ones(2))) == []
+        assert cut[-1][1] == len(time)
+        assert all(time[b - 1] - time[a] <= width for a, b in cut)
+        assert list(slices(time, width, last=False)) == cut[:-1]  # whether the last one is complete is not known
+    assert list(slices(time[:0], 1.0, last=True)) == []
+
+
+def test_slices_are_shorter_than_targets_report():
+    """A share of 0.4 of the shortest period of several sources; 0.9 of a radar's alone, four of one in rounds."""
+    assert slice_width([1.5, 2.0], [True, True]) == pytest.approx(0.4 * 1.5)
+    assert slice_width([4.0], [True]) == pytest.approx(3.6)
+    assert slice_width([0.5], [False]) == pytest.approx(2.0)
+    assert slice_width([5.0], [False]) == 4.0
 
 
 def test_a_target_that_reports_often_has_all_its_plots_used(rng):

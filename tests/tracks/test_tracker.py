@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from tracking_scenes import SITE, flights, measured, observed, polar_noise, run
+from tracking_scenes import SITE, measured, observed, polar_noise, run
 
 from saltus.evaluate import false_tracks, track_scores
 from saltus.geo import Plane
@@ -13,7 +13,6 @@ from saltus.simulate import Leg, Radar, Trajectory, observe
 from saltus.tracks.lifecycle import CONFIRMED
 from saltus.tracks.local import local_system
 from saltus.tracks.settings import FilterSettings, TrackerSettings
-from saltus.tracks.tracker import Tracker
 
 DT = 4.0
 TIMES = DT * np.arange(15)
@@ -385,12 +384,3 @@ def test_every_plot_has_a_fate(rng):
 def test_no_plots_at_all():
     found = run(measured([], np.zeros((0, 2)), 1.0))
     assert len(found.raw.track_id) == len(found.all_rows.time) == 0
-
-
-def test_progress_ends_at_one():
-    time, xy = flights([[0.0, 0.0]], [[100.0, 0.0]], TIMES)
-    shares = []
-    tracker = Tracker(TrackerSettings(), FilterSettings(), [DT], use_identity=True)
-    tracker.run(measured(time, xy, 10.0), lambda rows: None, shares.append)
-    assert shares[-1] == 1.0
-    assert (np.diff(shares) > 0).all()

@@ -1,5 +1,6 @@
 """Measurements and runs for the tests of the tracker, made without its own placing of plots where that is judged."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -7,11 +8,12 @@ import numpy as np
 from saltus.geo import Site
 from saltus.records import Kind, Plots, Source, System
 from saltus.tracks.measurements import Measurements, Noise, place_plots
-from saltus.tracks.rows import join_rows
+from saltus.tracks.rows import assignments, join_fates, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.sources import learn_setup
 from saltus.tracks.tracker import Tracker
 
-__all__ = ["SITE", "Tracked", "flights", "measured", "observed", "polar_noise", "run"]
+__all__ = ["SITE", "Tracked", "fed", "flights", "measured", "observed", "polar_noise", "run", "tracker_of"]
 
 SITE = Site(float(np.radians(48.0)), float(np.radians(11.0)), 500.0)
 
@@ -44,7 +46,7 @@ def measured(time, xy, sigma, *, altitude=None, sigma_altitude=10.0, source=0, i
         cov=cov,
         icao24=column(icao24, np.int32),
         mode3a=column(mode3a, np.int16),
-        named=np.zeros(n, bool),
+        callsign=np.full(n, "", "U8"),
         polar=np.full((n, 2), np.nan),
         ray=np.full((n, 2), np.nan),
         lever=np.zeros((n, 2)),
@@ -84,12 +86,25 @@ def observed(seen, radars, noise, plane, codes=None, height_prior=(5000.0, 3500.
     return m, label[order]
 
 
-def run(m, *, settings=None, filters=None, periods=(4.0,), identity=True, waits=None):
-    parts = []
+def tracker_of(m, *, settings=None, filters=None, periods=(4.0,), identity=True, waits=None):
     settings, filters = settings or TrackerSettings(), filters or FilterSettings()
-    tracker = Tracker(settings, filters, periods, use_identity=identity, waits=waits)
-    raw = tracker.run(m, parts.append)
-    rows = join_rows(parts)
+    setup = learn_setup(m, periods, waits, settings.clutter_density)
+    return Tracker(settings, filters, setup, use_identity=identity)
+
+
+def fed(tracker, m, chunk=None):
+    """What a tracker says of measurements in pieces of `chunk`: rows, and what became of each measurement."""
+    m = replace(m, plot=np.arange(len(m)))  # a scene put together of several may count anew in each
+    parts, step = [], chunk or max(len(m), 1)
+    for begin in range(0, len(m), step):
+        piece = np.arange(begin, min(begin + step, len(m)))
+        parts.append(tracker.feed(m.take(piece), last=begin + step >= len(m)))
+    rows, fates = join_rows([p.rows for p in parts]), join_fates([p.fates for p in parts])
+    return rows, assignments(m.plot, fates, [p.confirmed for p in parts], tracker.conditions)
+
+
+def run(m, **options):
+    rows, raw = fed(tracker_of(m, **options), m)
     good = np.flatnonzero(np.isin(rows.track_id, raw.confirmed))
     picked = {f: getattr(rows, f)[good] for f in rows._fields if f != "moments"}
     sure = rows._replace(moments=type(rows.moments)(*(c[good] for c in rows.moments)), **picked)

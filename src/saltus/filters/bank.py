@@ -1,6 +1,6 @@
 """Many multimode filters at once: rows that are added, stepped, scored, updated and removed as arrays."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import prod
 from typing import Any, Protocol, runtime_checkable
 
@@ -76,6 +76,16 @@ class Bank:
     def write(self, rows: _Rows, belief: Belief) -> None:
         """Overwrite rows."""
         self._store.write(rows, belief)
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Return what `restore` goes on from: the beliefs of all rows, and the free ones in the order of their use."""
+        return {**self.read(np.arange(self._capacity))._asdict(), "free": np.array(self._free, np.int64)}
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Hold what `state` gave, of a bank of the same states and chains: the same rows under the same numbers."""
+        self._capacity, self._free = len(state["log_probs"]), np.asarray(state["free"]).tolist()
+        self._store = _make_store(self.n, self.sizes, self._capacity, self.backend)
+        self.write(np.arange(self._capacity), Belief(*(np.asarray(state[name]) for name in Belief._fields)))
 
     def take(self, rows: _Rows) -> "Bank":
         """Return a new bank whose rows 0..k-1 are copies of `rows` (repeats allowed: hypotheses, resampling)."""

@@ -1,7 +1,8 @@
 """Matrix exponentials over an interval, and the exact discretisation of linear equations.
 
 Both start from a Taylor polynomial over a short piece h = dt / 2^s and double s times. What is doubled is
-exp(A h) - I, so that slow modes keep their digits however stiff the fast ones are.
+exp(A h) - I, so that slow modes keep their digits however stiff the fast ones are. Every matrix has its own s, so what
+one of many becomes does not depend on the others.
 """
 
 import numpy as np
@@ -34,10 +35,11 @@ def exponential(A: npt.ArrayLike) -> Float[np.ndarray, "*lead n n"]:
     """
     matrix = _square(numbers(A, "A"), "A")
     doublings = _doublings(matrix)
-    psi = _psi(matrix / 2.0**doublings)
+    psi = _psi(matrix / 2.0 ** doublings[..., None, None])
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(doublings):
-            psi = 2 * psi + psi @ psi
+        for k in range(int(doublings.max(initial=0))):
+            at = doublings > k
+            psi[at] = 2 * psi[at] + psi[at] @ psi[at]
     return _finite(np.eye(matrix.shape[-1]) + psi, matrix)
 
 
@@ -79,16 +81,19 @@ def discretise(
             f"dt {step.shape[:-2]}.\nAdd axes of length 1, for instance dt[:, None]."
         ) from None
     doublings = _doublings(drift * step)
-    h = step / 2.0**doublings
+    h = step / 2.0 ** doublings[..., None, None]
     psi, Q = _psi(drift * h), _integral(drift * h, (diffusion @ np.swapaxes(diffusion, -1, -2)) * h)
     eye = np.eye(n)
+    Q = np.broadcast_to(Q, np.broadcast_shapes(psi.shape, Q.shape)).copy()
+    psi, doublings = np.broadcast_to(psi, Q.shape).copy(), np.broadcast_to(doublings, Q.shape[:-2])
     with np.errstate(over="ignore", invalid="ignore"):
-        for _ in range(doublings):
-            phi = eye + psi
-            Q = Q + phi @ Q @ np.swapaxes(phi, -1, -2)
-            psi = 2 * psi + psi @ psi
+        for k in range(int(doublings.max(initial=0))):
+            at = doublings > k
+            phi = eye + psi[at]
+            Q[at] += phi @ Q[at] @ np.swapaxes(phi, -1, -2)
+            psi[at] = 2 * psi[at] + psi[at] @ psi[at]
     Q = (Q + np.swapaxes(Q, -1, -2)) / 2
-    Phi = np.broadcast_to(eye + psi, Q.shape).copy()
+    Phi = eye + psi
     return _finite(Phi, drift * step), _finite(Q, drift * step)
 
 
@@ -113,9 +118,10 @@ def _integral(A: FloatArray, N: FloatArray) -> FloatArray:
     return total
 
 
-def _doublings(A: FloatArray) -> int:
-    norm = float(np.abs(A).sum(axis=-2).max(initial=0.0))
-    return max(0, int(np.ceil(np.log2(norm / _SHORT)))) if norm > 0 else 0
+def _doublings(A: FloatArray) -> npt.NDArray[np.int64]:
+    """How often each piece is doubled, (...)."""
+    norm = np.abs(A).sum(axis=-2).max(axis=-1, initial=0.0)
+    return np.asarray(np.ceil(np.log2(np.maximum(norm / _SHORT, 1.0))), np.int64)
 
 
 def _square(A: FloatArray, what: str) -> FloatArray:

@@ -315,9 +315,9 @@ def _noise(sensor: SensorConfig, period: float) -> dict[str, float]:
 
 def _tables(tracked: Tracked, plots: Plots, config: Config) -> tuple[pa.Table, pa.Table]:
     """Return the rows of tracks that were confirmed at some time, in time order, and their gates."""
-    m, plane = tracked.measurements, tracked.plane
-    tracks = [track_table(rows, plane, plots, m, config.tracker.sigma_pressure) for rows in _chunks(tracked.rows)]
-    gates = [innovation_table(rows, plane, plots, m) for rows in _chunks(tracked.rows)]
+    plane = tracked.plane
+    tracks = [track_table(rows, plane, config.tracker.sigma_pressure) for rows in _chunks(tracked.rows)]
+    gates = [innovation_table(rows, plane, [str(s.system) for s in plots.sources]) for rows in _chunks(tracked.rows)]
     confirmed = pa.array(tracked.assignments.confirmed)
     tables = []
     for parts in (tracks, gates):

@@ -13,14 +13,16 @@ from saltus.records import Plots
 from saltus.summary import SIGMAS, Sensors, Tracked, reported_kind
 from saltus.tracks.measurements import Measurements, default_noise, place_plots
 from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
-from saltus.tracks.rows import Assignments, Rows, join_rows
+from saltus.tracks.rows import Assignments, Rows, assignments, join_fates, join_rows
 from saltus.tracks.settings import TrackerSettings
+from saltus.tracks.sources import learn_setup
 from saltus.tracks.tracker import Tracker
 
 __all__ = ["track_system"]
 
 _Array = npt.NDArray[np.float64]
 
+_AT_ONCE = 5_000  # measurements fed between two looks at the progress
 _NOISE_PLOTS = 5_000  # reports of each source that the noise is estimated from before tracking
 
 
@@ -44,9 +46,17 @@ def track_system(
         part: Plots, label: str, settings: TrackerSettings
     ) -> tuple[list[Rows], Measurements, Assignments, dict[int, NoiseEstimate]]:
         m = place_plots(part, plane, sensors.sites, noise, settings.height_prior)
-        tracker = Tracker(settings, config.filter, sensors.periods, use_identity=use_identity, waits=sensors.waits)
-        rows: list[Rows] = []
-        found = tracker.run(m, rows.append, lambda share: bar.working(label, share))
+        setup = learn_setup(m, sensors.periods, sensors.waits, settings.clutter_density)
+        tracker = Tracker(settings, config.filter, setup, use_identity=use_identity)
+        rows, fates, confirmed = [], [], []
+        for begin in range(0, len(m), _AT_ONCE):
+            end = min(begin + _AT_ONCE, len(m))
+            fed = tracker.feed(m.take(np.arange(begin, end)), last=end == len(m))
+            rows.append(fed.rows._replace(measurement=_places(m, fed.rows.measurement)))
+            fates.append(fed.fates)
+            confirmed.append(fed.confirmed)
+            bar.working(label, end / len(m))
+        found = assignments(m.plot, join_fates(fates), confirmed, tracker.conditions)
         kept = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)
         return rows, m, found, {s: estimate_noise(m, kept, s) for s in sources}
 
@@ -63,6 +73,11 @@ def track_system(
             noise[s] = replace(widened(noise[s], _steady_d2(rows, m, s)), **sensors.configured[s])
     rows, m, found, estimates = run(plots, "tracking", config.tracker)
     return Tracked(rows, m, found, plane, noise, estimates)
+
+
+def _places(m: Measurements, plots: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the place of each plot, by its number, among the measurements; -1 stays."""
+    return np.where(plots >= 0, np.searchsorted(m.plot, plots), -1)
 
 
 def _steady_d2(rows: Sequence[Rows], m: Measurements, s: int) -> _Array:

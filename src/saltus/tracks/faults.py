@@ -6,9 +6,10 @@ the measurement, and a plot is the mixture of them: the product of two more chai
 The plot's chain forgets; the source's is one for all tracks and lives here, so no track stores a mode for either.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,7 @@ _FAULTY_SHARE = 0.1  # of the range: faults scale with what a radar covers
 _LIVE = 0.01  # probability of a condition from which gates reckon with it
 _OWN_AFFAIR = 0.05  # probability that the error of a plot is its target's own affair and tells nothing of the source
 _LASTING = 4.0  # s that errors of one target last: it is heard once in that time
+_FORGOTTEN, _FEW_HEARD = 60.0, 64  # s, more than plots come late; and tracks that are no burden
 _ROUGH = 0.005  # of positions that transmitters tell err as under a degraded source, each by itself
 
 
@@ -145,6 +147,7 @@ class SourceCondition:
         self._log_probs = np.log(each.prod(axis=1)) if len(law.degraded) > 1 else np.zeros(1)
         self._time = -np.inf
         self._heard: dict[int, float] = {}  # when each track was last asked, s
+        self._kept = _FEW_HEARD
         self._history: list[tuple[float, _Array]] = []
 
     @property
@@ -152,6 +155,33 @@ class SourceCondition:
         """What has been found so far."""
         times = np.array([time for time, _ in self._history])
         return History(times, np.array([p for _, p in self._history]).reshape(-1, len(self.law.degraded)))
+
+    def drained(self) -> History:
+        """Return what has been found since the last time, and forget it."""
+        found, self._history = self.history, []
+        return found
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Return what `restore` goes on from: arrays by name."""
+        return {
+            "log_probs": self._log_probs,
+            "time": np.array(self._time),
+            "track": np.array(list(self._heard), np.int64),
+            "heard": np.array(list(self._heard.values()), np.float64),
+            "history_time": self.history.time,
+            "history_probs": self.history.probs,
+        }
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Go on from arrays that `state` gave."""
+        self._log_probs, self._time = np.array(state["log_probs"]), float(state["time"])
+        self._heard = dict(zip(state["track"].tolist(), state["heard"].tolist(), strict=True))
+        self._history = list(zip(state["history_time"].tolist(), np.array(state["history_probs"]), strict=True))
+
+    @property
+    def p_degraded(self) -> float:
+        """Probability that it is not well since its last scan."""
+        return float(1.0 - np.exp(self._log_probs[0]))
 
     @property
     def degraded(self) -> bool:
@@ -192,7 +222,14 @@ class SourceCondition:
         last = np.array([self._heard.get(k, -np.inf) for k in track.tolist()])
         now = np.maximum(time, last)
         self._heard.update(zip(track[confirmed].tolist(), now[confirmed].tolist(), strict=True))
+        self._forget(float(now.max(initial=-np.inf)))
         return np.where(confirmed, np.clip((time - last) / _LASTING, 0.0, 1.0), 0.0)
+
+    def _forget(self, now: float) -> None:
+        """Forget tracks heard so long ago that they have their full say again, when there are many of them."""
+        if len(self._heard) > 2 * self._kept:
+            self._heard = {k: t for k, t in self._heard.items() if t > now - _FORGOTTEN}
+            self._kept = max(_FEW_HEARD, len(self._heard))
 
     def absorb(self, time: float, prior: _Array, log_f: _Array, voice: _Array) -> _Array:
         """Take in a scan; return for every plot the log probabilities of its hypotheses before it was seen itself.

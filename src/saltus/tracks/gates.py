@@ -192,9 +192,9 @@ class Gate:
 
         Where targets report at times of their own, a neighbour's plot comes before the next one of a new target.
         """
-        plot, first = index[pairs.plot], life.plot[pairs.track]
+        plot = index[pairs.plot]
         dt = m.time[plot] - life.time[pairs.track]
-        soonest = np.where(m.source[plot] == m.source[first], _SOONEST * self._periods[m.source[plot]], 0.0)
+        soonest = np.where(m.source[plot] == life.source[pairs.track], _SOONEST * self._periods[m.source[plot]], 0.0)
         late = (dt >= soonest) | self._same_address(pairs, life, m, index)
         keep = np.where(life.status[pairs.track] == SEED, (dt > 0.0) & late, dt > _LATEST)
         if self._use_identity:

@@ -1,7 +1,8 @@
 """The filters of all tracks as rows: horizontal and vertical side by side, or jointly in three dimensions."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -123,6 +124,15 @@ class Kinematics:
 
     channels: tuple[Channel, ...]
     intervals: Intervals  # of the channels
+
+    def state(self) -> dict[str, Any]:
+        """Return what `restore` goes on from, by channel."""
+        return {str(k): channel.bank.state() for k, channel in enumerate(self.channels)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Hold the rows that `state` gave, of filters of the same settings."""
+        for k, channel in enumerate(self.channels):
+            channel.bank.restore(state[str(k)])
 
     def add(self, start: Start) -> _Rows:
         """Store new rows."""

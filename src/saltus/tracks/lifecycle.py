@@ -1,6 +1,7 @@
 """Birth, confirmation, coasting and death of tracks: one array element per bank row."""
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ class Birth(NamedTuple):
 
     time: _Array  # (k,), s
     period: _Array  # (k,), s
-    plot: npt.NDArray[np.intp]  # (k,)
+    plot: npt.NDArray[np.int64]  # (k,): its number
     mean: _Array  # (k, 6)
     cov: _Array  # (k, 6, 6)
 
@@ -34,7 +35,7 @@ class Lifecycle:
     def __init__(self, settings: TrackerSettings) -> None:
         """Make an empty table."""
         self._settings = settings
-        self._next_id = 1
+        self.next_id = 1
         self.active = np.zeros(0, bool)
         self.id = np.zeros(0, np.int64)
         self.status = np.zeros(0, np.int8)
@@ -49,9 +50,21 @@ class Lifecycle:
         self.has_altitude = np.zeros(0, bool)
         self.icao24 = np.zeros(0, np.int32)
         self.mode3a = np.zeros(0, np.int16)
-        self.plot = np.zeros(0, np.intp)  # last plot, as measurement index
-        self.sound = np.zeros(0, np.intp)  # last one that was not faulty
-        self.named = np.zeros(0, np.intp)  # last plot with a callsign, as measurement index, -1 none
+        self.plot = np.zeros(0, np.int64)  # number of the last plot
+        self.source = np.zeros(0, np.int32)  # of the last plot
+        self.sound_time = np.zeros(0)  # of the last plot that was not faulty, s
+        self.sound_source = np.zeros(0, np.int32)  # of that plot
+        self.callsign = np.zeros(0, "U8")  # "" none
+
+    def state(self) -> dict[str, npt.NDArray[Any]]:
+        """Return the columns by name: what `restore` goes on from."""
+        return {name: column for name, column in vars(self).items() if isinstance(column, np.ndarray)}
+
+    def restore(self, state: Mapping[str, npt.NDArray[Any]], next_id: int) -> None:
+        """Go on from columns that `state` gave, with the number of the next track."""
+        for name in self.state():
+            setattr(self, name, np.array(state[name]))
+        self.next_id = next_id
 
     def rows(self) -> _Rows:
         """Return the rows in use."""
@@ -61,23 +74,23 @@ class Lifecycle:
         """Start tracks of one plot in rows just added to the bank."""
         self._reserve(int(rows.max()) + 1 if len(rows) else 0)
         self.active[rows] = True
-        self.id[rows] = self._next_id + np.arange(len(rows))
-        self._next_id += len(rows)
+        self.id[rows] = self.next_id + np.arange(len(rows))
+        self.next_id += len(rows)
         self.status[rows] = SEED
         self.time[rows], self.period[rows], self.plot[rows] = birth[:3]
-        self.sound[rows] = birth.plot
         self.mean[rows], self.cov[rows] = birth[3:]
         self.located[rows] = birth.time
         self.history[rows] = 1
         self.coasted[rows] = 0
         self.p_fault[rows] = np.nan
         self.has_altitude[rows] = False
-        self.icao24[rows] = self.mode3a[rows] = self.named[rows] = NO_CODE
+        self.icao24[rows] = self.mode3a[rows] = NO_CODE
+        self.callsign[rows] = ""
 
     def renew(self, rows: _Rows) -> None:
         """Make new tracks of rows begun wrongly: of their last plot alone, and of its time and codes."""
-        self.id[rows] = self._next_id + np.arange(len(rows))
-        self._next_id += len(rows)
+        self.id[rows] = self.next_id + np.arange(len(rows))
+        self.next_id += len(rows)
         self.status[rows] = SEED
         self.history[rows] = 1
 
@@ -86,7 +99,7 @@ class Lifecycle:
         rows: _Rows,
         time: _Array,
         period: _Array,
-        plot: npt.NDArray[np.intp],
+        plot: npt.NDArray[np.int64],
         sound: npt.NDArray[np.bool_] | None = None,
     ) -> None:
         """Enter a plot for each row; confirm what has M plots of the last N expected, if this one is sound."""
@@ -103,8 +116,6 @@ class Lifecycle:
         self.located[rows] = np.maximum(self.located[rows], time)
         self.coasted[rows] = 0
         self.plot[rows] = plot
-        right = slice(None) if sound is None else sound
-        self.sound[rows[right]] = plot[right]
 
     def sighted(self, rows: _Rows, time: _Array) -> None:
         """Enter a bearing for each row: it moves the state, and neither confirms the track nor keeps it alive."""
@@ -164,8 +175,7 @@ class Lifecycle:
         if size <= old:
             return
         grown = max(size, 2 * old, 64)
-        for name, column in vars(self).items():
-            if isinstance(column, np.ndarray):
-                bigger = np.zeros((grown, *column.shape[1:]), column.dtype)
-                bigger[:old] = column
-                setattr(self, name, bigger)
+        for name, column in self.state().items():
+            bigger = np.zeros((grown, *column.shape[1:]), column.dtype)
+            bigger[:old] = column
+            setattr(self, name, bigger)

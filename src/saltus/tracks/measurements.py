@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -70,7 +71,7 @@ def default_noise(source: Source) -> Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurements:
-    """Usable reports in time order; `plot` is their index in the recording's plots."""
+    """Usable reports in time order; `plot` is the number of each in the order in which all reports came."""
 
     plot: npt.NDArray[np.intp]  # (N,)
     time: _Array  # (N,), s
@@ -79,7 +80,7 @@ class Measurements:
     cov: _Array  # (N, 3, 3), m^2; row and column of an unknown altitude are those of the unit matrix
     icao24: npt.NDArray[np.int32]
     mode3a: npt.NDArray[np.int16]
-    named: npt.NDArray[np.bool_]  # whether the report gives a callsign
+    callsign: npt.NDArray[Any]  # "" none
     polar: _Array  # (N, 2): slant range (m) and azimuth (rad) where the source measures them, else NaN
     ray: _Array  # (N, 2): from the site to the position in the plane, m; NaN where the source is not polar
     lever: _Array  # (N, 2): change of plane position per metre of height error, 0 where none
@@ -96,6 +97,15 @@ class Measurements:
     def take(self, index: npt.NDArray[np.intp]) -> "Measurements":
         """Return the measurements selected."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def columns(self) -> dict[str, npt.NDArray[Any]]:
+        """Return the columns by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    @classmethod
+    def join(cls, parts: Sequence["Measurements"]) -> "Measurements":
+        """Join measurements one behind the other."""
+        return cls(**{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(cls)})
 
     def density(self, source: int, period: float) -> float:
         """Return the reports of a source per m^2 and scan, over the circle of two deviations of its longer axis."""
@@ -232,7 +242,7 @@ def place_plots(
         cov=cov,
         icao24=plots.icao24[usable],
         mode3a=plots.mode3a[usable],
-        named=plots.callsign[usable] != "",
+        callsign=plots.callsign[usable].astype("U8"),
         polar=np.stack([plots.range[usable], plots.azimuth[usable]], axis=-1),
         ray=ray,
         lever=lever,

@@ -34,22 +34,20 @@ SINGLE = "single plot"  # no second plot near it
 NOT_CONFIRMED = "track not confirmed"
 
 
-def track_table(rows: Rows, plane: Plane, plots: Plots, m: Measurements, sigma_pressure: float) -> pa.Table:
+def track_table(rows: Rows, plane: Plane, sigma_pressure: float) -> pa.Table:
     """Return rows with the columns of tracks.parquet.
 
     The error of pressure altitude as height moves a radar plot along its ray by `lever` metres per metre; it is the
     same scan after scan, so no filter averages it out and it is added to the published covariance.
     """
     mean, cov = rows.moments.mean, rows.moments.cov.copy()
-    seen = rows.measurement >= 0
-    push = np.where(seen[:, None], m.lever[rows.measurement] * sigma_pressure, 0.0)
+    push = rows.lever * sigma_pressure
     cov[:, 0:3:2, 0:3:2] += push[:, :, None] * push[:, None, :]
     told = rows.has_altitude & (cov[:, 4, 4] <= _VAGUE**2)
     altitude = np.where(told, mean[:, 4], np.nan)
     true = plane.to_true(mean[:, :4], cov[:, :4, :4], altitude)
     ve, vn = true.velocity.T
     position, velocity = true.position_cov, true.velocity_cov
-    named = np.where(rows.named >= 0, plots.callsign[m.plot[rows.named]], "")
     return pa.table(
         {
             "track_id": rows.track_id,
@@ -75,24 +73,29 @@ def track_table(rows: Rows, plane: Plane, plots: Plots, m: Measurements, sigma_p
             "status": pa.array(np.array(STATUS)[rows.status], pa.string()),
             "icao24": pa.array([f"{c:06X}" if c >= 0 else None for c in rows.icao24], pa.string()),
             "mode3a": pa.array([f"{c:04o}" if c >= 0 else None for c in rows.mode3a], pa.string()),
-            "callsign": pa.array([str(c) or None for c in named], pa.string()),
+            "callsign": pa.array([str(c) or None for c in rows.callsign], pa.string()),
         }
     )
 
 
-def innovation_table(rows: Rows, plane: Plane, plots: Plots, m: Measurements) -> pa.Table:
-    """Return the gates of updated rows: centre, three-sigma half widths to true east and north, NIS."""
+def innovation_table(rows: Rows, plane: Plane, names: Sequence[str]) -> pa.Table:
+    """Return the gates of updated rows: centre, three-sigma half widths to true east and north, NIS.
+
+    Args:
+        rows: published rows.
+        plane: theirs.
+        names: designation of each source.
+    """
     seen = np.flatnonzero(rows.measurement >= 0)
     state, cov = np.zeros((len(seen), 4)), np.zeros((len(seen), 4, 4))
     state[:, 0::2], cov[:, 0::2, 0::2] = rows.centre[seen], rows.gate_cov[seen]
     true = plane.to_true(state, cov)
     half = 3.0 * np.sqrt(np.diagonal(true.position_cov, axis1=-2, axis2=-1))
-    names = [str(s.system) for s in plots.sources]
     return pa.table(
         {
             "track_id": rows.track_id[seen],
             "time": rows.time[seen],
-            "source": pa.array([names[s] for s in m.source[rows.measurement[seen]]], pa.string()),
+            "source": pa.array([names[s] for s in rows.source[seen]], pa.string()),
             "latitude": np.degrees(true.latitude),
             "longitude": np.degrees(true.longitude),
             "gate_e": half[:, 0],

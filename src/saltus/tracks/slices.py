@@ -1,13 +1,13 @@
 """The order in which plots are taken: slices of time, and rounds in which no target has two plots."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from saltus.tracks.measurements import Measurements
 
-__all__ = ["rounds", "shortest_share", "slices"]
+__all__ = ["rounds", "shortest_share", "slice_width", "slices"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -19,28 +19,35 @@ _LONGEST = 4.0  # s
 _DEVIATIONS = 4.0  # of two plots of one target
 
 
-def shortest_share(m: Measurements, source: int) -> float:
+def shortest_share(*, polar: bool) -> float:
     """Return the share of its period within which a target gives a source at most one plot."""
-    own = np.flatnonzero(m.source == source)
-    return _ROTATING if len(own) and np.isfinite(m.ray[own[0], 0]) else _OTHER
+    return _ROTATING if polar else _OTHER
 
 
-def slices(m: Measurements, periods: _Array) -> Iterator[tuple[int, int]]:
-    """Divide measurements in time order into short stretches; yield begin and end of each.
+def slice_width(periods: Sequence[float], polar: Sequence[bool]) -> float:
+    """Return how long a slice lasts, s.
 
     Args:
-        m: the measurements.
-        periods: update period of each source, s.
+        periods: update period of each source that gives reports, s.
+        polar: which of them measure range and azimuth.
     """
-    used, first = np.unique(m.source, return_index=True)
-    if not len(used):
-        return
-    rotating = np.isfinite(m.ray[first, 0]).all()
-    share = _OTHER if len(used) > 1 else _ROTATING if rotating else _IN_ROUNDS
-    width = min(_LONGEST, share * float(periods[used].min()))
+    share = _OTHER if len(periods) > 1 else _ROTATING if all(polar) else _IN_ROUNDS
+    return min(_LONGEST, share * min(periods, default=_LONGEST))
+
+
+def slices(time: _Array, width: float, *, last: bool) -> Iterator[tuple[int, int]]:
+    """Divide times in order into short stretches; yield begin and end of each that is complete.
+
+    Args:
+        time: s, (n,).
+        width: of a slice, s.
+        last: whether nothing follows, so that the last slice is complete, too; else it is when something later came.
+    """
     begin = 0
-    while begin < len(m):
-        end = int(np.searchsorted(m.time, m.time[begin] + width, side="right"))
+    while begin < len(time):
+        end = int(np.searchsorted(time, time[begin] + width, side="right"))
+        if end == len(time) and not last:
+            return
         yield begin, end
         begin = end
 

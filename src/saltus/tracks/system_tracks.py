@@ -140,8 +140,9 @@ def _scene(parts: Sequence[Part], place: Sequence[_Index], m: Measurements, rows
 def _renumbered(part: Part, at: _Index) -> Rows:
     """Rows of one system with measurements numbered through all."""
     rows = part.rows
-    measurement, named = (np.where(k >= 0, at[k], -1) if len(at) else k for k in (rows.measurement, rows.named))
-    return rows._replace(measurement=measurement, named=named)
+    return rows._replace(
+        measurement=np.where(rows.measurement >= 0, at[rows.measurement], -1) if len(at) else rows.measurement
+    )
 
 
 def _local_tracks(parts: Sequence[Part], place: Sequence[_Index], first: _Index, n: int) -> tuple[_Index, _Index]:
@@ -332,7 +333,7 @@ def _published(
     likeliest = np.where(polar & (fused.p_fault[:, -1] > fused.p_fault[:, 0]), 2, 1)
     nothing = np.full(len(lanes.number), -1)
     icao24, mode3a = (latest(c[lanes.number] if use_identity else nothing, lanes.track) for c in (m.icao24, m.mode3a))
-    named = np.where(m.named[lanes.number] & use_identity, lanes.number, -1)
+    named = latest(np.where((m.callsign[lanes.number] != "") & use_identity, lanes.number, -1), lanes.track)[at]
     keep = seen | (sure & (every.time <= m.time.max()))  # neither a tentative track is coasted, nor any after the end
     out = Rows(
         track_id=track,
@@ -342,13 +343,17 @@ def _published(
         has_altitude=since(np.isfinite(m.position[lanes.number, 2]), lanes.track)[at],
         icao24=icao24[at].astype(np.int32),
         mode3a=mode3a[at].astype(np.int16),
-        named=latest(named, lanes.track)[at],
+        callsign=np.where(named >= 0, m.callsign[named], ""),
         measurement=np.where(seen, index, -1),
+        source=np.where(seen, m.source[index], -1).astype(np.int32),
+        lever=np.where(seen[:, None], m.lever[index], 0.0),
         centre=fused.centre,
         gate_cov=fused.gate_cov,
         d2=d2,
         p_fault=held(wrong, track),
         fault=np.where(seen & np.isfinite(wrong), likeliest, 0).astype(np.int8),
+        p_degraded=np.full(len(at), np.nan),
+        time_known=every.time,
     )
     return _taken(out, np.flatnonzero(keep))
 

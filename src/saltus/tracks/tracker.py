@@ -1,119 +1,147 @@
 """The tracker's loop: slices of a scan in time order, all tracks of a slice as arrays."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
-from saltus.tracks.background import Background, background, flat
+from saltus.tracks.background import densities
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
-from saltus.tracks.kinematics import Plan, Start, make_kinematics, two_point_start, with_speed_prior
-from saltus.tracks.lifecycle import COASTED, CONFIRMED, SEED, TENTATIVE, Birth, Lifecycle
+from saltus.tracks.kept import Kept
+from saltus.tracks.kinematics import Plan, make_kinematics
+from saltus.tracks.lifecycle import CONFIRMED, SEED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
-from saltus.tracks.rows import Assignments, Rows
+from saltus.tracks.publish import Told, coasted_rows, updated_rows
+from saltus.tracks.rows import Fates, Fed, Rows, join_fates, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.sights import sight
 from saltus.tracks.slices import rounds, slices
+from saltus.tracks.sources import TrackerSetup
+from saltus.tracks.starts import Starts
 
 __all__ = ["Tracker"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
-_CLIMB = 15.0  # m/s: standard deviation of the vertical speed of a new track
 _SURPLUS = 1.5  # periods between two right plots, below which none is missing between them
 _NEGLIGIBLE = 1e-3  # probability of all other hypotheses of a plot that is taken for right
 _STANDING = np.array([-3.0, -2.0, 0.0])  # nats: a plot is less likely a seed's or a tentative track's own
 
 
 class Tracker:
-    """Multimode multitarget tracker over measurements in time order."""
+    """Multimode multitarget tracker over measurements in time order, fed in pieces of any size.
+
+    What it does in a slice depends on the slices before and on the setup alone, so the pieces change nothing. Between
+    pieces it holds tracks, the last plots they refer to, the conditions of sources, and the slice not yet complete.
+    """
 
     def __init__(
-        self,
-        settings: TrackerSettings,
-        filters: FilterSettings,
-        periods: Sequence[float],
-        *,
-        use_identity: bool,
-        waits: Sequence[float] | None = None,
+        self, settings: TrackerSettings, filters: FilterSettings, setup: TrackerSetup, *, use_identity: bool
     ) -> None:
         """Prepare an empty tracker.
 
         Args:
             settings: association, initiation and deletion.
             filters: the filters of every track.
-            periods: update period of each source, s.
+            setup: of the sources.
             use_identity: let Mode S addresses decide and Mode 3/A codes support the association.
-            waits: s between two reports of a target that each source leaves waiting longest, before one counts as
-                missed; the update periods if not given.
         """
-        self._settings = settings
-        self._periods = np.asarray(periods, float)
-        self._waits = self._periods if waits is None else np.asarray(waits, float)
+        self._settings, self._filters = settings, filters
         self._use_identity = use_identity
         self._kinematics = make_kinematics(filters)
         self._life = Lifecycle(settings)
-        self._gate = Gate(settings, filters, self._periods, use_identity=use_identity)
-        # The gate of a track of one plot, at rest with this deviation of speed, ends at the fastest target's.
-        self._seed_speed = settings.max_speed / np.sqrt(self._gate.horizontal)
-        sojourn = np.array(filters.sojourn_h)
-        self._mean_accel_sq = float(sojourn @ np.square(filters.accel_h) / sojourn.sum())
-        self._confirmed: list[npt.NDArray[np.int64]] = []
+        self._sources: list[SourceCondition] = []
+        self.adopt(setup)
+        self._starts = Starts(settings, filters, self._gate.horizontal)
+        self._pending: Measurements | None = None
+        self._last = Kept()
 
-    def run(
-        self,
-        measurements: Measurements,
-        emit: Callable[[Rows], None],
-        progress: Callable[[float], None] | None = None,
-    ) -> Assignments:
-        """Track all measurements.
+    def adopt(self, setup: TrackerSetup) -> None:
+        """Go on under another setup; sources keep their numbers, and new ones come behind them."""
+        self._setup = setup
+        self._periods = np.array([s.period for s in setup.sources])
+        self._gate = Gate(self._settings, self._filters, self._periods, use_identity=self._use_identity)
+        new = setup.sources[len(self._sources) :]
+        self._sources += [SourceCondition(plot_law(self._settings, polar=s.polar), self._settings) for s in new]
+
+    @property
+    def conditions(self) -> list[SourceCondition]:
+        """The condition of each source."""
+        return self._sources
+
+    def feed(self, measurements: Measurements, *, last: bool = False) -> Fed:
+        """Take measurements, none earlier than those before; return what is known anew.
 
         Args:
-            measurements: in time order.
-            emit: receives the published rows, slice by slice.
-            progress: receives the share done, 0 to 1.
+            measurements: in time order, their numbers ascending.
+            last: nothing follows within the time of a slice, so every slice is complete.
         """
-        self._m, self._emit = measurements, emit
-        self._track_id = np.zeros(len(measurements), np.int64)
-        self._split = np.zeros(len(measurements), bool)
-        self._elsewhere = np.zeros(len(measurements), bool)
-        self._speed = np.zeros(len(measurements))  # of the track after each plot that it took, m/s
-        self._background = self._densities(measurements)
-        self._sources = [self._condition(s) for s in range(len(self._periods))]
-        for begin, end in slices(measurements, self._periods):
-            self._housekeep(float(measurements.time[begin]))
-            sources = measurements.source[begin:end]
-            _, first = np.unique(sources, return_index=True)
-            for s in sources[np.sort(first)]:  # as they come, whatever number each has
-                own, period = begin + np.flatnonzero(sources == s), float(self._periods[s])
-                speed = self._settings.max_speed
-                for scan in rounds(measurements, own, period, speed, use_identity=self._use_identity):
-                    self._scan(scan, float(self._waits[s]))
-            if progress is not None:
-                progress(end / len(measurements))
-        confirmed = np.concatenate([np.zeros(0, np.int64), *self._confirmed])
-        return Assignments(self._track_id, self._split, self._elsewhere, np.unique(confirmed), self._sources)
+        m = measurements if self._pending is None else Measurements.join([self._pending, measurements])
+        parts, fates, confirmed, end = [], [], [np.zeros(0, np.int64)], 0
+        for begin, end in slices(m.time, self._setup.width, last=last):
+            fed = self._slice(m.take(np.arange(begin, end)))
+            parts.append(fed.rows)
+            fates.append(fed.fates)
+            confirmed.append(fed.confirmed)
+        self._pending = m.take(np.arange(end, len(m)))
+        return Fed(join_rows(parts), join_fates(fates), np.concatenate(confirmed))
 
-    def _condition(self, source: int) -> SourceCondition:
-        own = (self._m.source == source) & np.isfinite(self._m.position[:, 0])
-        law = plot_law(self._settings, polar=bool(own.any() and np.isfinite(self._m.ray[own, 0]).all()))
-        return SourceCondition(law, self._settings)
+    def _slice(self, m: Measurements) -> Fed:
+        """Go through one complete slice."""
+        n = len(m)
+        self._m, self._density = m, densities(m, [s.background for s in self._setup.sources])
+        self._known = float(m.time[-1])
+        self._rows: list[Rows] = []
+        self._confirmed: list[npt.NDArray[np.int64]] = [np.zeros(0, np.int64)]
+        self._renamed = [np.zeros((0, 2), np.int64)]
+        self._track_id, self._split, self._elsewhere = np.zeros(n, np.int64), np.zeros(n, bool), np.zeros(n, bool)
+        self._speed = np.zeros(n)  # of the track after each plot that it took, m/s
+        self._housekeep(float(m.time[0]))
+        _, first = np.unique(m.source, return_index=True)
+        for s in m.source[np.sort(first)].tolist():  # as they come, whatever number each has
+            own, source = np.flatnonzero(m.source == s), self._setup.sources[s]
+            speed = self._settings.max_speed
+            for scan in rounds(m, own, source.period, speed, use_identity=self._use_identity):
+                self._scan(scan, source.wait)
+        before = np.concatenate(self._renamed)
+        none = np.zeros(len(before), bool)
+        told = Fates(before[:, 0], before[:, 1], none, none)
+        fates = Fates(m.plot, self._track_id, self._split, self._elsewhere)
+        return Fed(join_rows(self._rows), join_fates([told, fates]), np.concatenate(self._confirmed))
 
-    def _densities(self, m: Measurements) -> Background:
-        """Clutter and new targets at each measurement."""
-        given = self._settings.clutter_density
-        return background(m, self._periods) if given is None else flat(len(m), given)
+    def state(self) -> dict[str, Any]:
+        """Return everything that `restore` goes on from, as arrays by name."""
+        return {
+            "life": self._life.state(),
+            "next_id": np.array(self._life.next_id),
+            "bank": self._kinematics.state(),
+            "source": {str(k): source.state() for k, source in enumerate(self._sources)},
+            "last": self._last.state(),
+            "pending": {} if self._pending is None else self._pending.columns(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on from what `state` gave, of a tracker of the same settings and setup."""
+        self._life.restore(state["life"], int(state["next_id"]))
+        self._kinematics.restore(state["bank"])
+        for k, source in enumerate(self._sources):
+            source.restore(state["source"][str(k)])
+        self._last.restore(state["last"])
+        self._pending = Measurements(**state["pending"]) if state["pending"] else None
 
     def _housekeep(self, now: float) -> None:
         """Publish what coasts; drop what is overdue or moves as no target does."""
         rows, expected = self._life.to_coast(now)
         while len(rows):
-            self._publish_coasted(rows, expected)
+            ahead = self._kinematics.predicted(rows, expected - self._life.time[rows])
+            moments = ahead.moments(np.arange(len(rows)))
+            self._rows.append(coasted_rows(self._life, rows, moments, expected, now))
             rows, expected = self._life.to_coast(now)
         life = self._life
         ended = np.unique(np.concatenate([life.overdue(now), life.too_fast(), life.repeated()]))
@@ -143,17 +171,20 @@ class Tracker:
         wrong, fault = source.law.faulty(p)
         again = self._twice_wrong(rows, plots, wrong)
         life.renew(rows[again])
-        self._track_id[life.plot[rows[again]]] = life.id[rows[again]]
+        self._rename(rows[again])
         new = again | (life.status[rows] == SEED)
         right = ~new & (wrong <= 0.5)
         surplus = self._surplus(rows[right], plots[right])
-        self._start(rows[new], plots[new])
+        if new.any():
+            first = self._last.of(rows[new])
+            self._kinematics.write(rows[new], self._starts.of_two(first, life.time[rows[new]], m, plots[new]))
         self._update(rows[~new], gated, chosen[~new], weights[~new], p[~new])
         self._enter(rows, plots, wait, gated.height_used[chosen], sound=new | (wrong <= 0.5))
         life.p_fault[rows] = np.where(new, np.nan, wrong)
         # Neither a start nor a fault, nor a degraded source, says whether the filter's innovations are what it thinks.
         d2 = np.where(new | (wrong > 0.5) | source.degraded, np.nan, gated.d2[chosen])
-        self._publish(rows, plots, gated.centre[chosen], gated.gate_cov[chosen], d2, np.where(new, 0, fault))
+        told = Told(gated.centre[chosen], gated.gate_cov[chosen], d2, np.where(new, 0, fault), source.p_degraded)
+        self._publish(rows, plots, told)
         left = np.ones(len(index), bool)
         left[gated.pairs.plot[chosen]] = False
         used = plots[life.status[rows] == CONFIRMED]
@@ -161,7 +192,8 @@ class Tracker:
         self._begin(index[left], used, wait)
         far = np.linalg.norm(m.position[plots, :2] - gated.centre[chosen], axis=-1) > self._settings.split_range
         self._also_begin(plots[~new & (wrong > 0.5) & far], used, wait)
-        self._seed(self._unnamed(surplus), wait)
+        if surplus is not None:
+            self._seed(surplus, self._unnamed(surplus, np.arange(len(surplus))), wait)
 
     def _twice_wrong(self, rows: _Index, plots: _Index, wrong: _Array) -> npt.NDArray[np.bool_]:
         """Say which tracks have begun wrongly: tentative ones with two faulty plots in a row.
@@ -173,18 +205,30 @@ class Tracker:
         twice = (life.status[rows] == TENTATIVE) & (wrong > 0.5) & (life.p_fault[rows] > 0.5)
         return np.asarray(twice & (self._m.time[plots] > life.time[rows]))
 
-    def _surplus(self, rows: _Index, plots: _Index) -> _Index:
+    def _rename(self, rows: _Index) -> None:
+        """The last plots of rows that begin anew are their new tracks' own."""
+        life, here = self._life, self._m.plot
+        plots = life.plot[rows]
+        at = np.minimum(np.searchsorted(here, plots), len(here) - 1)
+        inside = here[at] == plots
+        self._track_id[at[inside]] = life.id[rows[inside]]
+        self._renamed.append(np.column_stack([plots, life.id[rows]])[~inside])
+
+    def _surplus(self, rows: _Index, plots: _Index) -> Measurements | None:
         """Return plots that tracks took as faulty while their right ones came one period apart, as if none were.
 
         A target gives one plot a period, so they are another's. Each begins a track, if none has begun with it.
         """
         m, life = self._m, self._life
-        taken, right = life.plot[rows], life.sound[rows]
-        one = (m.source[taken] == m.source[plots]) & (m.source[right] == m.source[plots])
-        usual = m.time[plots] - m.time[right] < _SURPLUS * self._periods[m.source[plots]]
-        taken = taken[(life.p_fault[rows] > 0.5) & one & usual]
+        faulty = life.p_fault[rows] > 0.5
+        rows, plots = rows[faulty], plots[faulty]
+        if not len(rows):
+            return None
+        one = (life.source[rows] == m.source[plots]) & (life.sound_source[rows] == m.source[plots])
+        usual = m.time[plots] - life.sound_time[rows] < _SURPLUS * self._periods[m.source[plots]]
+        rows = rows[one & usual]
         live = life.rows()
-        return np.asarray(taken[~np.isin(taken, life.plot[live[life.status[live] == SEED]])])
+        return self._last.of(rows[~np.isin(life.plot[rows], life.plot[live[life.status[live] == SEED]])])
 
     def _update(self, rows: _Index, gated: Gated, pairs: _Index, log_weights: _Array, p: _Array) -> None:
         """Condition tracks on the plots chosen, each a mixture of what may be wrong with it.
@@ -216,43 +260,22 @@ class Tracker:
         self._kinematics.put(rows, seen.copies, seen.copy[chosen])
         life.sighted(rows, m.time[plots])
         self._track_id[plots] = life.id[rows]
-        nothing = np.full(len(rows), np.nan)
-        self._publish(rows, plots, seen.centre[chosen], seen.cov[chosen], nothing, np.zeros(len(rows), np.int8))
+        nothing, none = np.full(len(rows), np.nan), np.zeros(len(rows), np.int8)
+        self._publish(rows, plots, Told(seen.centre[chosen], seen.cov[chosen], nothing, none, np.nan))
 
     def _gain(self, gated: Gated, index: _Index, log_f: _Array) -> _Array:
         """Log-likelihood ratio of "this plot is this track's" against "the track missed and the plot is new"."""
         settings, m, life = self._settings, self._m, self._life
         track, plot = gated.pairs.track, index[gated.pairs.plot]
         detection = settings.detection_probability
-        gain = log_f - np.log(self._background.plane[plot]) + np.log(detection / (1.0 - detection))
-        has_height, new_height = np.isfinite(m.position[plot, 2]), self._background.height[plot]
+        gain = log_f - np.log(self._density.plane[plot]) + np.log(detection / (1.0 - detection))
+        has_height, new_height = np.isfinite(m.position[plot, 2]), self._density.height[plot]
         gain = gain + np.where(gated.height_used, np.log((1.0 - settings.altitude_outlier) / new_height), 0.0)
         gain = gain + np.where(has_height & ~gated.height_used, np.log(settings.altitude_outlier), 0.0)
         gain = gain + _STANDING[life.status[track]]
         if self._use_identity:
             gain = gain + identity_gain(life.icao24[track], m.icao24[plot], life.mode3a[track], m.mode3a[plot])
         return np.asarray(gain)
-
-    def _start(self, rows: _Index, plots: _Index) -> None:
-        """Begin the filters of tracks that found their second plot."""
-        m, life, prior = self._m, self._life, self._settings.height_prior
-        if not len(rows):
-            return
-        first, dt = life.plot[rows], m.time[plots] - life.time[rows]
-        way = m.position[plots, :2] - m.position[first, :2]
-        velocity = way / np.maximum(dt, np.linalg.norm(way, axis=-1) / self._settings.max_speed)[:, None]
-        (z0, R0), (z1, R1) = m.with_height(first, prior), m.with_height(plots, prior)
-        start = two_point_start(z0, R0 + m.stamped(first, velocity), z1, R1 + m.stamped(plots, velocity), dt)
-        start = with_speed_prior(start, self._settings.max_speed)
-        # The target may have manoeuvred between the two.
-        start.cov[:, [1, 3], [1, 3]] += self._mean_accel_sq * (0.5 * dt[:, None]) ** 2
-        known = np.isfinite(m.position[plots, 2])
-        one_height = ~(known & np.isfinite(m.position[first, 2]))
-        position, cov = m.with_height(np.where(known, plots, first)[one_height], prior)
-        start.mean[one_height, 4], start.mean[one_height, 5] = position[:, 2], 0.0
-        start.cov[one_height, 4:, :] = start.cov[one_height, :, 4:] = 0.0
-        start.cov[one_height, 4, 4], start.cov[one_height, 5, 5] = cov[:, 2, 2], _CLIMB**2
-        self._kinematics.write(rows, start)
 
     def _enter(
         self,
@@ -265,9 +288,11 @@ class Tracker:
         """Note plots, codes and status of the rows updated; what is not sound confirms no track."""
         life = self._life
         fresh = life.status[rows] != CONFIRMED
-        life.hit(rows, self._m.time[plots], np.full(len(rows), wait), plots, sound)
+        life.hit(rows, self._m.time[plots], np.full(len(rows), wait), self._m.plot[plots], sound)
         life.has_altitude[rows] |= height_used
-        self._note_codes(rows, plots)
+        self._note(rows, self._m, plots)
+        life.sound_time[rows[sound]] = self._m.time[plots[sound]]
+        life.sound_source[rows[sound]] = self._m.source[plots[sound]]
         self._track_id[plots] = life.id[rows]
         self._confirmed.append(life.id[rows[fresh & (life.status[rows] == CONFIRMED)]])
 
@@ -279,7 +304,7 @@ class Tracker:
         elsewhere = self._life.holds(self._m.icao24[plots]) & self._use_identity & ~split
         self._split[plots[split]], self._elsewhere[plots[elsewhere]] = True, True
         plots = plots[~split & ~elsewhere]
-        rows = self._seed(plots, wait)
+        rows = self._seed(self._m, plots, wait)
         self._track_id[plots] = self._life.id[rows]
 
     def _also_begin(self, plots: _Index, used: _Index, wait: float) -> None:
@@ -287,87 +312,46 @@ class Tracker:
 
         They stay with the track that took them.
         """
-        plots = self._unnamed(plots)
+        plots = self._unnamed(self._m, plots)
         if len(plots):
-            self._seed(plots[~self._split_from(plots, np.setdiff1d(used, plots))], wait)
+            self._seed(self._m, plots[~self._split_from(plots, np.setdiff1d(used, plots))], wait)
 
-    def _unnamed(self, plots: _Index) -> _Index:
+    def _unnamed(self, m: Measurements, plots: _Index) -> _Index:
         """Leave out plots with an address, which settles whose they are."""
-        return plots[(self._m.icao24[plots] < 0) | (not self._use_identity)]
+        return plots[(m.icao24[plots] < 0) | (not self._use_identity)]
 
     def _split_from(self, plots: _Index, used: _Index) -> npt.NDArray[np.bool_]:
         settings = self._settings
         reach = settings.split_range, np.radians(settings.split_azimuth)
         return self._m.split_from(plots, used, self._speed[used], *reach)
 
-    def _seed(self, plots: _Index, wait: float) -> _Index:
+    def _seed(self, m: Measurements, plots: _Index, wait: float) -> _Index:
         """Begin a track with every plot."""
         if not len(plots):
             return np.zeros(0, np.intp)
-        m, life, settings = self._m, self._life, self._settings
-        mean, cov = np.zeros((len(plots), 6)), np.zeros((len(plots), 6, 6))
-        mean[:, 0::2], cov[:, 0::2, 0::2] = m.with_height(plots, settings.height_prior)
-        cov[:, [1, 3], [1, 3]] = self._seed_speed**2
-        cov[:, 5, 5] = _CLIMB**2
-        rows = self._kinematics.add(Start(mean, cov))
-        life.begin(rows, Birth(m.time[plots], np.full(len(plots), wait), plots, mean, cov))
+        life, start = self._life, self._starts.of_one(m, plots)
+        rows = self._kinematics.add(start)
+        life.begin(rows, Birth(m.time[plots], np.full(len(plots), wait), m.plot[plots], *start))
         life.has_altitude[rows] = np.isfinite(m.position[plots, 2])
-        self._note_codes(rows, plots)
+        self._note(rows, m, plots)
+        life.sound_time[rows], life.sound_source[rows] = m.time[plots], m.source[plots]
         return rows
 
-    def _note_codes(self, rows: _Index, plots: _Index) -> None:
+    def _note(self, rows: _Index, m: Measurements, plots: _Index) -> None:
+        """Note the plots and codes of rows."""
+        life = self._life
+        self._last.note(rows, m, plots)
+        life.source[rows] = m.source[plots]
         if self._use_identity:
-            m, life = self._m, self._life
             life.icao24[rows] = np.where(m.icao24[plots] >= 0, m.icao24[plots], life.icao24[rows])
             life.mode3a[rows] = np.where(m.mode3a[plots] >= 0, m.mode3a[plots], life.mode3a[rows])
-            life.named[rows] = np.where(m.named[plots], plots, life.named[rows])
+            life.callsign[rows] = np.where(m.callsign[plots] != "", m.callsign[plots], life.callsign[rows])
 
-    def _publish(
-        self, rows: _Index, plots: _Index, centre: _Array, gate_cov: _Array, d2: _Array, fault: npt.NDArray[np.int8]
-    ) -> None:
+    def _publish(self, rows: _Index, plots: _Index, told: Told) -> None:
         if len(rows):
             life, moments = self._life, self._kinematics.moments(rows)
             life.mean[rows], life.cov[rows] = moments.mean, moments.cov
-            codes = life.icao24[rows], life.mode3a[rows], life.named[rows]
-            self._emit(
-                Rows(
-                    life.id[rows],
-                    life.time[rows],  # of the state: a late plot is older
-                    moments,
-                    life.status[rows],
-                    life.has_altitude[rows],
-                    *codes,
-                    plots,
-                    centre,
-                    gate_cov,
-                    d2,
-                    life.p_fault[rows],
-                    fault.astype(np.int8),
-                )
-            )
-
-    def _publish_coasted(self, rows: _Index, time: _Array) -> None:
-        life, nothing = self._life, np.full(len(rows), -1)
-        ahead = self._kinematics.predicted(rows, time - life.time[rows])
-        moments = ahead.moments(np.arange(len(rows)))
-        self._emit(
-            Rows(
-                life.id[rows],
-                time,
-                moments,
-                np.full(len(rows), COASTED, np.int8),
-                life.has_altitude[rows],
-                life.icao24[rows],
-                life.mode3a[rows],
-                life.named[rows],
-                nothing,
-                moments.mean[:, [0, 2]],
-                moments.cov[:, [[0], [2]], [0, 2]],
-                np.full(len(rows), np.nan),
-                life.p_fault[rows],
-                np.zeros(len(rows), np.int8),
-            )
-        )
+            self._rows.append(updated_rows(life, rows, moments, self._m, plots, told, self._known))
 
 
 def _normalised(log_p: _Array) -> _Array:

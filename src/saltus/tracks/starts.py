@@ -1,0 +1,64 @@
+"""Where tracks begin: at rest with their first plot, and by difference with their second."""
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.tracks.kinematics import Start, two_point_start, with_speed_prior
+from saltus.tracks.measurements import Measurements
+from saltus.tracks.settings import FilterSettings, TrackerSettings
+
+__all__ = ["Starts"]
+
+_Array = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.intp]
+
+_CLIMB = 15.0  # m/s: standard deviation of the vertical speed of a new track
+
+
+class Starts:
+    """First states of tracks."""
+
+    def __init__(self, settings: TrackerSettings, filters: FilterSettings, gate: float) -> None:
+        """Fix what is known of targets; `gate` is the quantile of the horizontal gate."""
+        self._settings = settings
+        # The gate of a track of one plot, at rest with this deviation of speed, ends at the fastest target's.
+        self._speed = settings.max_speed / np.sqrt(gate)
+        sojourn = np.array(filters.sojourn_h)
+        self._mean_accel_sq = float(sojourn @ np.square(filters.accel_h) / sojourn.sum())
+
+    def of_one(self, m: Measurements, plots: _Index) -> Start:
+        """States of tracks with one plot each: at rest."""
+        mean, cov = np.zeros((len(plots), 6)), np.zeros((len(plots), 6, 6))
+        mean[:, 0::2], cov[:, 0::2, 0::2] = m.with_height(plots, self._settings.height_prior)
+        cov[:, [1, 3], [1, 3]] = self._speed**2
+        cov[:, 5, 5] = _CLIMB**2
+        return Start(mean, cov)
+
+    def of_two(self, before: Measurements, time: _Array, m: Measurements, plots: _Index) -> Start:
+        """States of tracks that found their second plot.
+
+        Args:
+            before: the first plot of each track, (k,).
+            time: of the tracks, s.
+            m: measurements.
+            plots: the second plot of each track.
+        """
+        every, prior = np.arange(len(plots)), self._settings.height_prior
+        dt = m.time[plots] - time
+        way = m.position[plots, :2] - before.position[:, :2]
+        slowest = np.linalg.norm(way, axis=-1) / self._settings.max_speed
+        velocity = way / np.maximum(dt, slowest)[:, None]
+        (z0, R0), (z1, R1) = before.with_height(every, prior), m.with_height(plots, prior)
+        R0, R1 = R0 + before.stamped(every, velocity), R1 + m.stamped(plots, velocity)
+        start = with_speed_prior(two_point_start(z0, R0, z1, R1, dt), self._settings.max_speed)
+        # The target may have manoeuvred between the two.
+        start.cov[:, [1, 3], [1, 3]] += self._mean_accel_sq * (0.5 * dt[:, None]) ** 2
+        one, other = np.isfinite(before.position[:, 2]), np.isfinite(m.position[plots, 2])
+        flat = np.flatnonzero(~(one & other))
+        latest = other[flat]
+        start.mean[flat, 4] = np.where(latest, z1[flat, 2], z0[flat, 2])
+        start.mean[flat, 5] = 0.0
+        start.cov[flat, 4:, :] = start.cov[flat, :, 4:] = 0.0
+        start.cov[flat, 4, 4] = np.where(latest, R1[flat, 2, 2], R0[flat, 2, 2])
+        start.cov[flat, 5, 5] = _CLIMB**2
+        return start
