@@ -22,6 +22,7 @@ __all__ = [
     "flat_model",
     "is_psd",
     "mix_all_pairs",
+    "smooth_enumerated",
     "textbook_imm",
 ]
 
@@ -162,6 +163,60 @@ def enumerate_modes(f):
     spread = x - mean
     cov = np.einsum("sk,sknm->knm", w, P + spread[..., :, None] * spread[..., None, :])
     return Run(probs, mean.reshape(n_steps, n), cov, np.diff(evidence, prepend=0.0))
+
+
+def smooth_enumerated(f):
+    """The exact smoother: of each mode sequence the dense Gaussian of all states given all measurements."""
+    n_steps, n_modes = len(f.z), len(f.probs0)
+    log_w, sequences, means, covs = [], [], [], []
+    for sequence in product(range(n_modes), repeat=n_steps + 1):
+        prior = f.probs0[sequence[0]] * np.prod([f.trans[k, sequence[k], sequence[k + 1]] for k in range(n_steps)])
+        if prior == 0.0:
+            continue
+        pick = (np.arange(n_steps), np.array(sequence[1:]))
+        mean, cov, total = _dense_smoother(
+            f.z,
+            f.F[pick],
+            f.Q[pick],
+            f.H[pick],
+            f.R[pick],
+            f.b[pick],
+            f.d[pick],
+            f.mean0[sequence[0]],
+            f.cov0[sequence[0]],
+        )
+        log_w.append(np.log(prior) + total)
+        sequences.append(sequence)
+        means.append(mean)
+        covs.append(cov)
+    w, sequences, x, P = np.exp(log_w - logsumexp(log_w)), np.array(sequences), np.array(means), np.array(covs)
+    probs = np.array([[w[sequences[:, k + 1] == j].sum() for j in range(n_modes)] for k in range(n_steps)])
+    pairs = np.zeros((n_steps, n_modes, n_modes))
+    for k in range(n_steps):
+        np.add.at(pairs[k], (sequences[:, k], sequences[:, k + 1]), w)
+    mean = np.einsum("s,skn->kn", w, x)
+    spread = x - mean
+    cov = np.einsum("s,sknm->knm", w, P + spread[..., :, None] * spread[..., None, :])
+    return Run(probs, mean, cov, logsumexp(log_w)), pairs
+
+
+def _dense_smoother(z, F, Q, H, R, b, d, mean0, cov0):
+    """All states given all measurements: one joint Gaussian of s = (x_0, w_1..w_T), one solve."""
+    (n_steps, _), n = z.shape, len(mean0)
+    s_mean, s_cov = np.concatenate([mean0, b.ravel()]), block_diag(cov0, *Q)
+    x, states = np.eye(n, len(s_mean)), []
+    for k in range(n_steps):
+        x = F[k] @ x
+        x[:, n * (k + 1) : n * (k + 2)] += np.eye(n)
+        states.append(x)
+    X = np.concatenate(states)
+    seen = ~np.isnan(z).ravel()
+    Y, noise = (block_diag(*H) @ X)[seen], block_diag(*R)[np.ix_(seen, seen)]
+    nu = z.ravel()[seen] - d.ravel()[seen] - Y @ s_mean
+    S, U = Y @ s_cov @ Y.T + noise, X @ s_cov @ Y.T
+    mean, cov = X @ s_mean + U @ np.linalg.solve(S, nu), X @ s_cov @ X.T - U @ np.linalg.solve(S, U.T)
+    blocks = cov.reshape(n_steps, n, n_steps, n)[np.arange(n_steps), :, np.arange(n_steps)]
+    return mean.reshape(n_steps, n), blocks, multivariate_normal.logpdf(nu, np.zeros(len(nu)), S) if len(nu) else 0.0
 
 
 def mix_all_pairs(probs, means, covs, trans):

@@ -36,6 +36,7 @@ _EXPORTS = {
     "SaltusError": "saltus.errors",
     "discretise": "saltus.models",
     "imm_filter": "saltus.filters",
+    "imm_smoother": "saltus.filters",
     "spherical_to_cartesian": "saltus.geo",
     "threshold": "saltus.identify",
 }

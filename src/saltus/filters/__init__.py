@@ -11,6 +11,7 @@ from saltus.filters.moments import Adapt, GaussianSumFilter, MomentFilter
 from saltus.filters.particle import BoundParticleFilter, ParticleFilter
 from saltus.filters.rao_blackwell import particle_filter
 from saltus.filters.run import IMM, Record
+from saltus.filters.smoother import imm_smoother
 from saltus.filters.steps import Belief
 
 __all__ = [
@@ -36,5 +37,6 @@ __all__ = [
     "coloured_filter",
     "exact_filter",
     "imm_filter",
+    "imm_smoother",
     "particle_filter",
 ]
