@@ -57,8 +57,10 @@ $(READY): pyproject.toml $(NATIVE)
 	$(BIN)/python -m pip install -q -e '.[dev]'
 	@touch $@
 
+# Only what the extra names: saltus itself is installed, and installing it again would compile it again.
 $(DOCS_READY): $(READY)
-	$(BIN)/python -m pip install -q -e '.[docs]'
+	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' \
+	  | $(BIN)/python -m pip install -q -r /dev/stdin
 	@touch $@
 
 clean:

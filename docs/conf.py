@@ -7,6 +7,7 @@ import sys
 from importlib.metadata import version as distribution_version
 from pathlib import Path
 
+import jaxtyping  # noqa: F401 - before saltus, so that signatures show shapes
 from docutils import nodes
 from docutils.parsers.rst import Directive
 from docutils.utils.math import latex2mathml

@@ -101,6 +101,11 @@ def test_the_installed_script_is_this_program():
     assert done.stdout.split()[-1] == PROJECT["version"]
 
 
+def test_the_module_is_the_same_program():
+    done = subprocess.run([sys.executable, "-m", "saltus", "--help"], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("Usage: saltus [OPTIONS]")
+
+
 def test_an_unknown_study_is_refused_with_the_known_ones(tmp_path):
     line = refused("study", "no-such-study", "-o", tmp_path / "out")
     assert "no-such-study" in line

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float
 
 from saltus.errors import DataError, ModelError
+from saltus.shapes import Bool, Float
 
 __all__ = ["Alarms", "Calibration", "alarms", "calibrate", "cusum", "shiryaev"]
 

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError, ModelError
+from saltus.shapes import Float
 
 __all__ = ["Decision", "decide", "decide_chains"]
 

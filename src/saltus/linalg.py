@@ -1,7 +1,8 @@
 """Algebra on stacks of small matrices, where NumPy has no word for it."""
 
 import numpy as np
-from jaxtyping import Float
+
+from saltus.shapes import Float
 
 __all__ = ["block_diagonal", "gaussian_terms", "logsumexp", "quadratic_form", "symmetric"]
 

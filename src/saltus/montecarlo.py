@@ -4,9 +4,9 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Shaped
 
 from saltus.errors import ModelError
+from saltus.shapes import Shaped
 
 __all__ = ["run"]
 

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.diagnose.fit import NoiseFit
 from saltus.diagnose.likelihood import Series, pack
 from saltus.diagnose.residuals import Residuals
+from saltus.shapes import Float
 from saltus.studies.style import BLUE, GREY, INK, ORANGE, TEAL, new_figure, save
 
 if TYPE_CHECKING:

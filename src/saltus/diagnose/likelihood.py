@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
+
+from saltus.shapes import Float
 
 __all__ = ["Series", "Sums", "innovations", "log_likelihood", "pack", "sums"]
 

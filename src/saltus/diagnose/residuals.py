@@ -6,13 +6,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus import io
 from saltus.config import Config
 from saltus.errors import DataError
 from saltus.geo import Site
 from saltus.records import Kind, Plots
+from saltus.shapes import Float
 from saltus.tracks.measurements import default_noise, make_plane, place_plots
 
 __all__ = ["Phase", "Residuals", "from_recordings", "from_table"]

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float
 
 from saltus.errors import DataError, ModelError
+from saltus.shapes import Bool, Float
 
 __all__ = ["Consistency", "Interval", "consistency", "mean_over_runs", "nees", "nis", "rmse"]
 

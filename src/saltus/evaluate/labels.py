@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float, Int
 
 from saltus.errors import DataError, ModelError
+from saltus.shapes import Bool, Float, Int
 
 __all__ = ["FalseTracks", "TrackScores", "false_tracks", "track_scores"]
 

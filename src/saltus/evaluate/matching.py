@@ -18,12 +18,12 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.errors import DataError
 from saltus.evaluate.estimation import nees
 from saltus.evaluate.reference import Reference, around
 from saltus.geo import ecef_to_geodetic, local_basis
+from saltus.shapes import Float, Int
 
 __all__ = ["Matches", "Places", "Tracks", "match", "match_rows", "target_places", "track_places"]
 

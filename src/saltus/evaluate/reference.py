@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float, Int
 
 from saltus.geo import ecef_to_geodetic, geodetic_to_ecef, local_basis
+from saltus.shapes import Bool, Float, Int
 
 __all__ = ["Around", "Known", "Reference", "around", "each_time_once", "make_reference"]
 

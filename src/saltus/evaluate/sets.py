@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.errors import DataError, ModelError
+from saltus.shapes import Float, Int
 
 __all__ = ["GOSPA", "OSPA", "gospa", "ospa"]
 

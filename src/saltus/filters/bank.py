@@ -6,7 +6,6 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.errors import ModelError
 from saltus.filters import steps
@@ -15,6 +14,7 @@ from saltus.filters.memoryless import merge
 from saltus.filters.particles import Merged, Tables, expanded, merged
 from saltus.filters.steps import Belief
 from saltus.linalg import logsumexp
+from saltus.shapes import Float, Int
 
 __all__ = ["Bank", "NumpyStore"]
 

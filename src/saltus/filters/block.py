@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError, NumericalError
+from saltus.shapes import Float
 
 __all__ = ["BlockGain", "block_gain"]
 

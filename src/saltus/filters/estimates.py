@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.decisions import Decision, decide
 from saltus.errors import ModelError
 from saltus.models.findings import Finding, per_interval
 from saltus.models.hybrid import HybridModel
+from saltus.shapes import Float
 
 __all__ = ["Estimates", "described"]
 

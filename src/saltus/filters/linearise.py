@@ -17,12 +17,12 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from saltus.errors import ModelError, NumericalError
 from saltus.filters import steps
 from saltus.linalg import gaussian_terms
 from saltus.models import BoundSensor
+from saltus.shapes import Bool, Float
 
 __all__ = ["Affine", "Linearisation", "cholesky", "linearise", "sensor_joint", "sensor_update"]
 

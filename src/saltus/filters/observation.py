@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float
 
 from saltus.errors import DataError, ModelError
 from saltus.linalg import gaussian_terms
 from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE, as_diffusion
+from saltus.shapes import Bool, Float
 
 __all__ = ["Observation", "elapsed", "innovation_nis", "measured", "observation"]
 

@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.errors import ModelError
 from saltus.filters import steps
 from saltus.linalg import symmetric
+from saltus.shapes import Float, Int
 
 __all__ = ["Merged", "Tables", "effective_size", "expanded", "generator", "group_error", "merged", "systematic"]
 

@@ -14,10 +14,10 @@ from math import prod
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from saltus.errors import NumericalError
 from saltus.linalg import gaussian_terms, logsumexp, quadratic_form, symmetric
+from saltus.shapes import Bool, Float
 
 __all__ = [
     "NOT_POSITIVE",

@@ -14,11 +14,11 @@ environments, for conditioning on the sequence.
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.filters import steps
 from saltus.filters.flat import Flat
 from saltus.models import DiffusionSensor
+from saltus.shapes import Float, Int
 
 __all__ = ["informed_covariance"]
 

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
+from saltus.shapes import Float
 
 __all__ = [
     "Site",

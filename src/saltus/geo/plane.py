@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.geo.earth import ECCENTRICITY_SQ, SEMI_MAJOR
+from saltus.shapes import Float
 
 if TYPE_CHECKING:
     import pyproj

@@ -2,9 +2,9 @@
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError
+from saltus.shapes import Float
 
 __all__ = ["spherical_to_cartesian", "variance"]
 

@@ -1,11 +1,11 @@
 """Which local tracks of two systems could be one object at all: those that were near each other while both lived."""
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from saltus.errors import ModelError
 from saltus.identify.local import LocalTracks, PairSettings, Spans, spans
 from saltus.models.checks import FloatArray
+from saltus.shapes import Float, Int
 
 __all__ = ["candidate_pairs"]
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.errors import DataError, ModelError
 from saltus.identify.assignment import best_with_margins
@@ -21,6 +20,7 @@ from saltus.identify.groups import Conflict, ConflictLog, consistent, representa
 from saltus.identify.lanes import Index
 from saltus.identify.verdict import posterior
 from saltus.models.checks import FloatArray, probability
+from saltus.shapes import Float, Int
 
 __all__ = ["DecisionSettings", "Decisions", "Episodes", "decide_pairs"]
 

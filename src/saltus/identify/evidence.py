@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from saltus.errors import DataError, ModelError
 from saltus.identify.lanes import Index, flatten
 from saltus.identify.local import LocalTracks, PairSettings, spans
 from saltus.identify.pairs import Ratios, candidate_pairs, pair_ratios
 from saltus.models.checks import FloatArray
+from saltus.shapes import Float, Int
 
 __all__ = ["APART", "Evidence", "as_evidence", "join_evidence", "pair_evidence"]
 

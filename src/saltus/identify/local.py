@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
 
 from saltus.errors import DataError, ModelError
 from saltus.linalg import block_diagonal
 from saltus.models import Chain
 from saltus.models.checks import FloatArray, covariance, numbers, same
+from saltus.shapes import Bool, Float, Int
 
 __all__ = ["LocalTracks", "PairSettings", "Spans", "spans"]
 

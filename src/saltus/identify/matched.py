@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError
 from saltus.identify.lanes import Index
 from saltus.identify.local import LocalTracks, PairSettings
 from saltus.models.checks import FloatArray, covariance
+from saltus.shapes import Float
 
 __all__ = ["PairDraws", "Schedule", "different_pairs", "same_pairs", "wide_spreads"]
 

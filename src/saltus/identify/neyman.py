@@ -4,13 +4,13 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from saltus.errors import DataError, ModelError
 from saltus.identify.local import PairSettings
 from saltus.identify.matched import Schedule, different_pairs, wide_spreads
 from saltus.identify.pairs import Ratios, pair_ratios
 from saltus.models.checks import FloatArray
+from saltus.shapes import Float
 
 __all__ = ["FalseRatios", "false_ratios", "filled"]
 

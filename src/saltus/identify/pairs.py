@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.errors import DataError
 from saltus.identify.candidates import candidate_pairs
@@ -27,6 +26,7 @@ from saltus.identify.lanes import (
 )
 from saltus.identify.local import LocalTracks, PairSettings, Spans, spans
 from saltus.models.checks import FloatArray
+from saltus.shapes import Float, Int
 
 __all__ = ["LocalTracks", "PairSettings", "Ratios", "candidate_pairs", "pair_ratios"]
 

@@ -13,12 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError, ModelError
 from saltus.filters.steps import condition, measure, propagate
 from saltus.models import discretise
 from saltus.models.checks import FloatArray, covariance, numbers
+from saltus.shapes import Float
 
 __all__ = ["RatioTerms", "identification_llr", "identification_terms"]
 

@@ -14,10 +14,10 @@ import operator
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError, ModelError
 from saltus.models.checks import FloatArray, covariance, numbers
+from saltus.shapes import Float
 
 __all__ = ["p_correct", "p_false", "separation", "threshold"]
 

@@ -17,7 +17,6 @@ Source: Julier and Uhlmann (1997) for covariance intersection; the information f
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError, ModelError
 from saltus.identify.lanes import Index
@@ -25,6 +24,7 @@ from saltus.identify.local import LocalTracks, spans
 from saltus.linalg import symmetric
 from saltus.models import constant_velocity
 from saltus.models.checks import FloatArray
+from saltus.shapes import Float
 
 __all__ = ["doubled", "track_updates", "tracklets"]
 

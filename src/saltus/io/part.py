@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from jaxtyping import Int
 
 from saltus.records import Contents, Kind, Plots, System, Traits
+from saltus.shapes import Int
 from saltus.text import shown
 
 __all__ = ["Part", "printable", "revisit", "rotating", "scan_period"]

@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError
 from saltus.models.checks import FloatArray
 from saltus.models.sensors import Measured
+from saltus.shapes import Float
 
 __all__ = ["Arrays", "Layout", "stack_sensors"]
 

@@ -5,7 +5,6 @@ from dataclasses import InitVar, dataclass, field
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.checks import FloatArray, intervals, numbers, same, unit_steps
@@ -19,6 +18,7 @@ from saltus.models.markov import (
     stay_matrix,
     stochastic,
 )
+from saltus.shapes import Float
 
 __all__ = ["RESERVED", "Chain"]
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from saltus.errors import ModelError
@@ -14,6 +13,7 @@ from saltus.models.dependence import Matrix, TimeDependent, fixed, is_fixed
 from saltus.models.noise import GaussMarkov, MarkovNoise
 from saltus.models.observer import Observer
 from saltus.models.sensors import LinearSensor
+from saltus.shapes import Float
 
 __all__ = ["ColouredSensor"]
 

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.chain import Chain
@@ -22,6 +21,7 @@ from saltus.models.checks import FloatArray, numbers, same
 from saltus.models.dependence import TimeDependent, fixed
 from saltus.models.observer import Observer
 from saltus.models.sensors import BoundSensor, LinearSensor, Sensor
+from saltus.shapes import Float
 
 __all__ = ["OK", "BoundFaultySensor", "Condition", "FaultySensor", "lost", "outliers"]
 

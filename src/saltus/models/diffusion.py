@@ -10,10 +10,10 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.checks import FloatArray, covariance, numbers, same
+from saltus.shapes import Float
 
 __all__ = ["Field", "SwitchingSDE", "field_value", "probe_states"]
 

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError, ModelError
 from saltus.linalg import gaussian_terms
 from saltus.models.checks import FloatArray, covariance, numbers, same
 from saltus.models.diffusion import Field, field_value
 from saltus.models.nonlinear import wrapped_difference
+from saltus.shapes import Float
 
 __all__ = ["DiffusionSensor"]
 

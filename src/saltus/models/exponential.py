@@ -7,10 +7,10 @@ one of many becomes does not depend on the others.
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError, NumericalError
 from saltus.models.checks import FloatArray, intervals, numbers
+from saltus.shapes import Float
 
 __all__ = ["discretise", "exponential"]
 

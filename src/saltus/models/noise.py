@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.chain import Chain
 from saltus.models.checks import FloatArray, axes, covariance, numbers, same
 from saltus.models.dependence import Matrix, fixed, is_fixed, resolve
+from saltus.shapes import Float
 
 __all__ = ["GaussMarkov", "MarkovNoise", "first_order", "second_order", "stationary_covariance"]
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.geo import wrap
@@ -14,6 +13,7 @@ from saltus.models.checks import FloatArray, covariance, numbers, probability, s
 from saltus.models.dependence import Matrix, fixed, is_fixed, resolve
 from saltus.models.observer import Observer
 from saltus.models.sensors import at_time
+from saltus.shapes import Float
 
 __all__ = ["FunctionSensor", "checked_offset", "wrapped_difference"]
 

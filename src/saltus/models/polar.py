@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError, NumericalError
 from saltus.geo import wrap
@@ -19,6 +18,7 @@ from saltus.models.dependence import Matrix, fixed, is_fixed, resolve
 from saltus.models.nonlinear import checked_offset, wrapped_difference
 from saltus.models.observer import Observer
 from saltus.models.sensors import at_time
+from saltus.shapes import Float
 
 __all__ = ["PolarSensor"]
 

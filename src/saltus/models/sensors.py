@@ -6,13 +6,13 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models.chain import Chain
 from saltus.models.checks import FloatArray, axes, covariance, numbers, probability, same
 from saltus.models.dependence import Matrix, TimeDependent, fixed, is_fixed, resolve
 from saltus.models.observer import Observer
+from saltus.shapes import Float
 
 __all__ = ["BoundSensor", "LinearSensor", "Measured", "PositionSensor", "Sensor", "at_time"]
 

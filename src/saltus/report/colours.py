@@ -2,7 +2,8 @@
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
+
+from saltus.shapes import Float
 
 __all__ = ["HEIGHT_ENDS", "PROBABILITY_ENDS", "colour_map", "oklab_to_srgb", "srgb_to_oklab", "system_colours"]
 

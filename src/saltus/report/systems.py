@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Int
 
 from saltus.identify import Conflict, Decisions, DecisionSettings, Evidence
+from saltus.shapes import Int
 from saltus.tracks.membership import Segments
 
 __all__ = [

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus import montecarlo
 from saltus.evaluate.estimation import nees
@@ -23,6 +22,7 @@ from saltus.filters.coloured import after_first, run_differenced
 from saltus.filters.coloured_model import Augmented
 from saltus.linalg import block_diagonal
 from saltus.models import discretise
+from saltus.shapes import Float
 
 __all__ = ["FILTERS", "PAPER_RATE", "STEPS", "Trial", "follow", "oscillator", "run_coloured", "scripted_modes"]
 

@@ -14,12 +14,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus import montecarlo
 from saltus.evaluate import nees
 from saltus.filters import Estimates, imm_filter
 from saltus.models import discretise
+from saltus.shapes import Float, Int
 
 __all__ = [
     "CHAINS",

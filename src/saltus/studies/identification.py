@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float
 
 from saltus.identify import (
     FalseRatios,
@@ -30,6 +29,7 @@ from saltus.identify import (
     same_pairs,
 )
 from saltus.models import discretise
+from saltus.shapes import Bool, Float
 
 __all__ = [
     "AFTER",

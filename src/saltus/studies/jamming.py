@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus import montecarlo
 from saltus.filters import imm_filter
@@ -25,6 +24,7 @@ from saltus.models import (
     constant_velocity,
     lost,
 )
+from saltus.shapes import Float, Int
 
 __all__ = [
     "FAULTS",

@@ -13,11 +13,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus import montecarlo
 from saltus.filters import Estimates, GaussianSumFilter, GridFilter, MomentFilter
 from saltus.models import DiffusionSensor, SwitchingSDE
+from saltus.shapes import Float
 from saltus.simulate import DiffusionDraws, simulate_diffusion
 
 __all__ = ["CASES", "FILTERS", "Case", "Errors", "Outcome", "errors", "filters", "run_case"]

@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float
 
 from saltus import montecarlo
 from saltus.errors import ModelError
 from saltus.filters import Estimates, imm_filter, steps
 from saltus.geo import spherical_to_cartesian
+from saltus.shapes import Bool, Float
 from saltus.simulate import radar_paper_trajectory
 
 __all__ = ["FILTERS", "SIGMA", "Followed", "Scene", "Trial", "follow", "run_radar", "scene", "two_point_start"]

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool
 
 from saltus.evaluate.estimation import Interval, mean_over_runs, rmse
 from saltus.geo import spherical_to_cartesian
+from saltus.shapes import Bool
 from saltus.studies.radar import FILTERS, SIGMA, Scene, Trial, run_radar, scene
 from saltus.studies.radar_figures import draw_radar
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
+from saltus.shapes import Float
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.slices import shortest_share
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float
 
+from saltus.shapes import Bool, Float
 from saltus.tracks.measurements import Measurements
 
 __all__ = ["GROUPS", "PARAMETERS", "BiasSeries", "corrected", "effects", "learnt", "second_order", "spread"]

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.identify import LocalTracks
+from saltus.shapes import Float, Int
 from saltus.tracks.bias import effects
 
 __all__ = ["Blocks", "SystemTracks", "encounters", "medians"]

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.filters import imm_filter
+from saltus.shapes import Float, Int
 from saltus.tracks.intervals import Intervals
 from saltus.tracks.kinematics import Channel, Moments, make_kinematics
 from saltus.tracks.settings import FilterSettings, TrackerSettings

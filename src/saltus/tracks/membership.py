@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
 
 from saltus.identify import Episodes
+from saltus.shapes import Float, Int
 
 __all__ = ["Segments", "segments"]
 

@@ -1,12 +1,12 @@
 """How far a grid must reach: where the diffusion may be, before anything is measured."""
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from saltus.errors import NumericalError
 from saltus.filters.grid.generator import Axes, generator
 from saltus.filters.grid.propagate import uniformised
 from saltus.models import SwitchingSDE
+from saltus.shapes import Float, Int
 
 __all__ = ["axes_within", "reach", "start"]
 

@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import DataError, ModelError
 from saltus.filters.estimates import Estimates
@@ -17,6 +16,7 @@ from saltus.filters.grid.propagate import Propagator, dense, split, uniformised
 from saltus.filters.observation import Observation, innovation_nis, observation
 from saltus.linalg import symmetric
 from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE
+from saltus.shapes import Float
 
 __all__ = ["GridDensity", "GridFilter"]
 

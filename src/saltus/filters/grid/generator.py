@@ -12,10 +12,10 @@ its lines are shifted instead (`saltus.filters.grid.propagate`).
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from saltus.errors import ModelError
 from saltus.models import SwitchingSDE
+from saltus.shapes import Float
 
 __all__ = ["Axes", "Generator", "Switch", "generator"]
 

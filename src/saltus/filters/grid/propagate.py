@@ -6,10 +6,10 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.filters.grid.generator import Generator
 from saltus.models import exponential
+from saltus.shapes import Float
 
 __all__ = ["Propagator", "dense", "split", "uniformised"]
 

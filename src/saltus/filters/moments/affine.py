@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.filters.moments.basis import Basis, basis, gaussian_points, normal_nodes
 from saltus.filters.moments.belief import Moments, Points, root_of
 from saltus.linalg import symmetric
 from saltus.models import DiffusionSensor, SwitchingSDE
+from saltus.shapes import Float
 
 __all__ = ["Affine", "affine", "is_affine", "predict_affine"]
 

@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float, Int
+
+from saltus.shapes import Float, Int
 
 __all__ = [
     "Basis",

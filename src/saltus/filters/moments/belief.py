@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.filters.moments.basis import Basis, convolved
 from saltus.linalg import symmetric
+from saltus.shapes import Float
 
 __all__ = ["Cloud", "Moments", "Points", "add_noise", "moments_of", "root_of"]
 

@@ -4,12 +4,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.filters.moments.basis import Basis, Rule, basis, gauss_hermite, gauss_legendre
 from saltus.filters.moments.belief import Moments, Points
 from saltus.filters.moments.maxent import Fit, fit, gaussian_parameter, tables
 from saltus.filters.moments.realisable import margin, shrunk
+from saltus.shapes import Float
 
 __all__ = ["Closing", "ClosureName", "Density", "Tally", "reach"]
 

@@ -7,9 +7,9 @@ from math import comb
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import ModelError
+from saltus.shapes import Float
 
 __all__ = ["edgeworth_median", "edgeworth_mode", "paper_mode", "pearson_mode", "unconditional"]
 

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float, Int
 
 from saltus.filters.estimates import Estimates
 from saltus.filters.moments.basis import Basis, basis
@@ -15,6 +14,7 @@ from saltus.filters.moments.posterior import MomentPosterior
 from saltus.filters.moments.realisable import deviation
 from saltus.filters.observation import Observation
 from saltus.linalg import symmetric
+from saltus.shapes import Bool, Float, Int
 
 __all__ = ["Diagnostics", "Kept", "MomentHistory", "estimates_of", "kept", "recorded"]
 

@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float, Int
 
 from saltus.filters.moments.basis import Basis, Rule, basis, gauss_legendre
+from saltus.shapes import Bool, Float, Int
 
 __all__ = ["Fit", "Tables", "fit", "gaussian_parameter", "tables"]
 

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from saltus.errors import DataError
 from saltus.filters.moments.belief import Points, root_of
 from saltus.filters.moments.closure import Closing
 from saltus.filters.observation import Observation
 from saltus.models import SwitchingSDE
+from saltus.shapes import Float
 
 __all__ = ["SeenSwitch", "certain", "checked_switches", "switched"]
 

@@ -6,11 +6,11 @@ from itertools import product
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.filters.moments.belief import Points
 from saltus.filters.moments.closure import Density
 from saltus.models import DiffusionSensor
+from saltus.shapes import Float
 
 __all__ = ["MomentPosterior"]
 

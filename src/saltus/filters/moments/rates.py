@@ -2,11 +2,11 @@
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.filters.moments.basis import Basis, gaussian_points
 from saltus.filters.moments.belief import Points
 from saltus.models import SwitchingSDE
+from saltus.shapes import Float
 
 __all__ = ["moment_rates"]
 

@@ -4,9 +4,9 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Bool, Float
 
 from saltus.filters.moments.basis import Basis, basis
+from saltus.shapes import Bool, Float
 
 __all__ = ["MARGIN", "deviation", "margin", "shrunk"]
 

@@ -13,7 +13,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.errors import NumericalError
 from saltus.filters.moments.basis import Basis
@@ -24,6 +23,7 @@ from saltus.filters.moments.rates import moment_rates
 from saltus.filters.moments.realisable import margin
 from saltus.filters.moments.recursion import first_moments
 from saltus.models import SwitchingSDE
+from saltus.shapes import Float
 
 __all__ = ["Stationary", "stationary_moments"]
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from jaxtyping import Float
 
 from saltus.filters.moments.basis import Rule
 from saltus.filters.moments.belief import Points, root_of
@@ -19,6 +18,7 @@ from saltus.filters.moments.closure import Closing, Density
 from saltus.filters.observation import innovation_nis
 from saltus.linalg import symmetric
 from saltus.models import DiffusionSensor
+from saltus.shapes import Float
 
 __all__ = ["Updated", "update"]
 
