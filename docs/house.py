@@ -35,9 +35,10 @@ WORDS = {
     "toml": "TOML files as tables",
     "compiled": "the compiled twins, where built",
     "errors": "ModelError, DataError, NumericalError",
+    "shapes": "shapes of arrays in annotations",
 }
 _COLOURS = (
-    (("errors", "geo", "records", "io"), "#eef3ee", "#a9c2aa"),
+    (("errors", "shapes", "geo", "records", "io"), "#eef3ee", "#a9c2aa"),
     (("models", "simulate", "decisions", "filters", "identify", "tracks"), "#fbeeea", "#dba792"),
     (("evaluate", "montecarlo", "studies"), "#f3eef7", "#bfa9d1"),
     ((), "#e9f0f8", "#9db8d6"),
