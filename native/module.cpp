@@ -15,6 +15,8 @@
 
 #include "arguments.hpp"
 
+void bind_asterix_frames(nanobind::module_& module);
+
 namespace {
 
 bool runs_here(const Kernel* kernel) {
@@ -299,7 +301,8 @@ class Bank {
 }  // namespace
 
 NB_MODULE(_native, module) {
-  module.doc() = "Compiled twins of saltus.filters.";
+  module.doc() = "Compiled twins of saltus.filters, saltus.framing.";
+  bind_asterix_frames(module);
   module.def("instruction_sets", &instruction_sets);
   module.def("lanes", [](const std::string& isa) { return kernel_of(isa).lanes; });
   module.def("multiply_adds", [](const std::string& isa, std::int64_t rounds) {

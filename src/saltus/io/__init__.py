@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from saltus.errors import DataError
-from saltus.io.capture import CAPTURE_MAGIC
+from saltus.framing.capture import MAGIC
 from saltus.io.merge import merge
 from saltus.io.part import Part, printable
 from saltus.records import Recording
@@ -48,7 +48,7 @@ def _parquet(path: Path, date: datetime.date | None, editions: Mapping[int, str]
 
 FORMATS = (
     Format("Parquet table", (".parquet", ".pq"), (b"PAR1",), _parquet),
-    Format("packet capture", (".pcap", ".pcapng", ".cap"), CAPTURE_MAGIC, _asterix),
+    Format("packet capture", (".pcap", ".pcapng", ".cap"), MAGIC, _asterix),
     Format("ASTERIX", (".ast", ".raw", ".asterix"), (), _asterix),
     Format("CSV table", (".csv",), (), _csv),
 )

@@ -1,4 +1,4 @@
-"""Read ASTERIX recordings: plain files (.ast, .raw) and packet captures (.pcap).
+"""Read ASTERIX recordings in every framing that `saltus.framing` knows.
 
 Target reports are taken from CAT010, CAT021 and CAT048, system tracks from CAT062, the antenna's turns from CAT034;
 one file of this folder says what becomes of the items of each. Records of other categories are counted.
@@ -14,8 +14,7 @@ from pathlib import Path
 
 from saltus.errors import DataError
 from saltus.io.assemble import CATEGORIES, TIME_ITEM, Records, assemble
-from saltus.io.blocks import Block, frame_capture, frame_plain
-from saltus.io.capture import CAPTURE_MAGIC
+from saltus.io.blocks import Block, read_blocks
 from saltus.io.layout import Malformed, categories, layout
 from saltus.io.part import Part
 from saltus.records import Contents, Plots, System
@@ -33,25 +32,26 @@ def read_asterix(
     *,
     date: datetime.date | None,
     editions: Mapping[int, str],
+    framing: str | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Part:
     """Read one recording.
 
     Args:
-        path: plain ASTERIX or packet capture, told apart by content.
+        path: the file.
         date: of the first record; None = by the capture clock, else 1970-01-01.
         editions: category -> edition; categories not named are guessed.
+        framing: one of `saltus.framing.NAMES`; None has it guessed.
         progress: called with the file's name and the fraction read.
 
     Raises:
         DataError: the file is empty, holds no record, or an edition does not exist or is plainly not the file's.
     """
-    data = path.read_bytes()
     name = path.name
-    if not data:
+    blocks, told, dated = read_blocks(path, framing, None)
+    if not path.stat().st_size:
         raise DataError(f"{path}: byte 0: the file is empty.")
-    captured = data[:4] in CAPTURE_MAGIC
-    blocks, problems = frame_capture(data, name) if captured else frame_plain(data, name)
+    problems = list(told.problems)
     notes: dict[int, tuple[str, ...]] = {}
     chosen: dict[int, str] = {}
     unread = []
@@ -65,12 +65,13 @@ def read_asterix(
             problems.append(f"{name}: byte {mine[0].offset}: category {number} is not read: {note}")
     records = _walk(blocks, chosen, problems, name, progress)
     if any(r.fspecs for r in records.values()):
-        part = assemble(name, records, notes, problems, date if date or not captured else "capture clock")
+        part = assemble(name, records, notes, problems, date if date or not dated else "capture clock")
         return part._replace(contents=(*part.contents, *unread))
     if not unread:
-        said = f" {problems[0]}" if problems else ""
+        over = ", ".join(f"{n} of {what}" for what, n in told.passed.items())
+        said = (f" {problems[0]}" if problems else "") + (f" Passed over: {over}." if over else "")
         raise DataError(f"{path}: no ASTERIX record could be read: wrong format, category or edition?{said}")
-    return Part(Plots.build(0, (), (name,), {}), None, tuple(unread), tuple(problems), in_order=True, dated=captured)
+    return Part(Plots.build(0, (), (name,), {}), None, tuple(unread), tuple(problems), in_order=True, dated=dated)
 
 
 def _edition(number: int, blocks: Sequence[Block], asked: str | None, name: str) -> tuple[str, str]:
