@@ -53,6 +53,13 @@ def _said(error: OSError) -> str:
     return error.strerror if error.filename is None else f"{error.strerror}: {error.filename}"
 
 
+_FRAMING = click.option(
+    "--framing",
+    metavar="NAME",
+    help="Container of ASTERIX: plain, gps, ioss, ioss-seq, oradis, rff, hdlc, pcap, pcapng; else told by structure.",
+)
+
+
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(package_name="saltus", prog_name="saltus")
 def main() -> None:
@@ -63,8 +70,9 @@ def main() -> None:
 @click.argument("inputs", nargs=-1, type=_FILE)
 @click.option("--config", type=_FILE, help="TOML file: date, editions.")
 @click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
+@_FRAMING
 @click.option("--system", is_flag=True, help="Say which kernel and instruction set this installation uses.")
-def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, system: bool) -> None:
+def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, framing: str | None, system: bool) -> None:
     """Say what is in a recording: systems, counts, time span, period, fields, rejected reports."""
     if system:
         from saltus.filters.backend import system_report
@@ -76,7 +84,7 @@ def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, system
     if inputs:
         from saltus.info import show_info
 
-        show_info(inputs, config, date)
+        show_info(inputs, config, date, framing)
 
 
 @main.command()
@@ -84,6 +92,7 @@ def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, system
 @click.option("-o", "--output", required=True, type=_FILE, help="Output directory.")
 @click.option("--config", type=_FILE, help="TOML file: date, [[sensor]] sites and noise, tracker settings.")
 @click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
+@_FRAMING
 @click.option(
     "--identity", type=click.Choice(["use", "ignore"]), default="use", show_default=True, help="Codes of the plots."
 )
@@ -95,6 +104,7 @@ def track(
     output: Path,
     config: Path | None,
     date: str | None,
+    framing: str | None,
     identity: str,
     time_from: str | None,
     time_to: str | None,
@@ -103,7 +113,7 @@ def track(
     """Track recordings: tracks.parquet, assignments.parquet, summary.json, report.html in OUTPUT."""
     from saltus.run import track_files
 
-    track_files(inputs, output, config, date, identity, time_from, time_to, report=not no_report)
+    track_files(inputs, output, config, date, identity, time_from, time_to, report=not no_report, framing=framing)
 
 
 @main.command()
@@ -124,6 +134,7 @@ def score(output: Path, truth: Path, json_path: Path | None, cutoff: float) -> N
 @click.option("-o", "--output", required=True, type=_FILE, help="Output directory.")
 @click.option("--config", type=_FILE, help="Of recordings: TOML file with date, [[sensor]] sites, tracker settings.")
 @click.option("--date", help="Of recordings: date, YYYY-MM-DD.")
+@_FRAMING
 @click.option("--reference", type=_FILE, help="Of recordings: Parquet of the same plots with BDS 5,0.")
 @click.option("--runs", type=click.IntRange(min=2), help="Monte-Carlo runs (default: the study's own).")
 @click.option("--seed", type=int, default=0, show_default=True)
@@ -133,6 +144,7 @@ def study(
     output: Path,
     config: Path | None,
     date: str | None,
+    framing: str | None,
     reference: Path | None,
     runs: int | None,
     seed: int,
@@ -147,8 +159,8 @@ def study(
             raise click.UsageError("the study faults tracks its recording; it has no --runs. Vary --seed.")
         from saltus.injection import study_faults
 
-        study_faults(recordings, output, config, date, reference, seed)
-    elif recordings or config or date or reference:
+        study_faults(recordings, output, config, date, reference, seed, framing)
+    elif recordings or config or date or framing or reference:
         raise click.UsageError(f"the study {name} simulates: it takes no recording. The study faults does.")
     else:
         from saltus.progress import progress_bar
@@ -220,6 +232,7 @@ def diagnose() -> None:
 @click.option("--reference", multiple=True, type=_FILE, help="Recording of better positions of the same aircraft.")
 @click.option("--config", type=_FILE, help="TOML file: date, [[sensor]] sites, editions.")
 @click.option("--date", help="Date of the recordings, YYYY-MM-DD.")
+@_FRAMING
 @click.option("--columns", help="Of a table with a column time: the residuals, as east,north.")
 @click.option("--series", help="Column of the table that tells objects or passes apart.")
 @click.option(
@@ -236,6 +249,7 @@ def noise(
     reference: tuple[Path, ...],
     config: Path | None,
     date: str | None,
+    framing: str | None,
     columns: str | None,
     series: str | None,
     phase: Literal["all", "air", "ground"],
@@ -251,6 +265,7 @@ def noise(
         reference=reference,
         config_path=config,
         date=date,
+        framing=framing,
         columns=names,
         series=series,
         motion=motion,

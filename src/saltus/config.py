@@ -1,6 +1,7 @@
 """The configuration: what recordings do not tell, and what a user may set, as TOML.
 
 date = 2023-05-02                 # of the first record: ASTERIX carries only the time of day
+framing = "ioss"                  # optional: the container of the recordings; else told by their structure
 
 [[sensor]]
 sac = 20
@@ -39,6 +40,7 @@ from typing import Annotated, TypeVar, get_type_hints
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from saltus.errors import ModelError
+from saltus.framing import NAMES
 from saltus.io.layout import categories
 from saltus.records import System
 from saltus.text import brief, cut, shown
@@ -121,6 +123,7 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     date: datetime.date | None = None
+    framing: str | None = None
     sensor: tuple[SensorConfig, ...] = ()
     editions: dict[int, str] = Field(default_factory=dict)
     tracker: TrackerSettings = Field(default_factory=TrackerSettings)
@@ -134,14 +137,26 @@ class Config(BaseModel):
         return min(found, key=lambda s: s.category is None, default=None)
 
 
-def load_config(path: Path | str | None) -> Config:
+def load_config(path: Path | str | None, *, date: str | None = None, framing: str | None = None) -> Config:
     """Read and check a configuration file; without one, the defaults.
+
+    Args:
+        path: TOML file.
+        date: YYYY-MM-DD, and
+        framing: a name, as given on the command line: they go before what the file says.
 
     Raises:
         ModelError: the file is no TOML, a key is unknown, or a value cannot be; the message names file, key and value.
     """
-    if path is None:
-        return Config()
+    given: dict[str, object] = {}
+    if date is not None:
+        given["date"] = parse_date(date)
+    if framing is not None:
+        given["framing"] = framing
+    return (Config() if path is None else _load(path)).model_copy(update=given)
+
+
+def _load(path: Path | str) -> Config:
     content = load_toml(path)
     _known(path, "", content, Config.model_fields)
     values: dict[str, object] = {
@@ -154,7 +169,15 @@ def load_config(path: Path | str | None) -> Config:
     }
     if "date" in content:
         values["date"] = _date(path, content["date"])
+    if "framing" in content:
+        values["framing"] = _framing(path, content["framing"])
     return Config.model_validate(values)
+
+
+def _framing(path: Path | str, value: object) -> str:
+    if value not in NAMES:
+        raise ModelError(f"{path}: framing = {value!r}: choose one of {', '.join(NAMES)}, or leave it out.")
+    return str(value)
 
 
 def parse_date(text: str) -> datetime.date:

@@ -11,9 +11,10 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from saltus.config import Config, load_config, parse_date
+from saltus.config import Config, load_config
 from saltus.errors import DataError, SaltusError
-from saltus.io import read_part
+from saltus.io import Told, read_part
+from saltus.io.inputs import expand
 from saltus.io.merge import merge
 from saltus.io.part import Part
 from saltus.records import Contents, Recording
@@ -25,27 +26,28 @@ _PLAIN_WIDTH = 120  # columns when the output is no terminal
 _DAY = 86400.0  # s
 
 
-def show_info(inputs: Sequence[Path], config_path: Path | None, date: str | None) -> None:
+def show_info(inputs: Sequence[Path], config_path: Path | None, date: str | None, framing: str | None) -> None:
     """Print systems, editions, counts, times, update period, fields and rejected reports of recordings.
 
     Files that cannot be read are named after all others are shown.
 
     Args:
-        inputs: files.
+        inputs: files, directories, patterns.
         config_path: TOML file with date, editions and sensors, or None.
         date: YYYY-MM-DD of the first record; goes before the configuration's.
+        framing: one of `saltus.framing.NAMES`; None has it guessed.
 
     Raises:
         DataError: files cannot be read at all.
         ModelError: the configuration or the date is wrong.
     """
-    config = load_config(config_path)
-    day = parse_date(date) if date else config.date
+    config = load_config(config_path, date=date, framing=framing)
+    told = Told(config.date, config.editions, config.framing)
     parts: list[Part] = []
     failures: dict[str, SaltusError | OSError] = {}
-    for path in inputs:
+    for path in expand(inputs):
         try:
-            parts.append(read_part(path, date=day, editions=config.editions))
+            parts.append(read_part(path, told))
         except (SaltusError, OSError) as error:
             failures.setdefault(str(error), error)
     console = Console(highlight=False)

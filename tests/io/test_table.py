@@ -291,7 +291,7 @@ def test_scans_of_one_time_tell_the_update_period(tmp_path):
 def test_nothing_and_directories(tmp_path):
     with pytest.raises(DataError, match="no input given"):
         read([])
-    with pytest.raises(DataError, match="is a directory"):
+    with pytest.raises(DataError, match="none of its 0 files is a recording"):
         read([tmp_path])
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from saltus.config import load_config, parse_date
+from saltus.config import load_config
 from saltus.diagnose.figure import draw_noise
 from saltus.diagnose.fit import NoiseFit, Parameter, fit_noise
 from saltus.diagnose.residuals import Phase, Residuals, from_recordings, from_table
@@ -24,6 +24,7 @@ def diagnose_noise(
     reference: Sequence[Path] = (),
     config_path: Path | None = None,
     date: str | None = None,
+    framing: str | None = None,
     columns: Sequence[str] = (),
     series: str | None = None,
     motion: bool = False,
@@ -37,6 +38,7 @@ def diagnose_noise(
         reference: recordings of better positions of the same aircraft; then `inputs` are recordings too.
         config_path: TOML configuration with sites and editions, for recordings.
         date: YYYY-MM-DD of the recordings.
+        framing: of ASTERIX recordings, one of `saltus.framing.NAMES`; None has it guessed.
         columns: of the table: residuals, or positions with `motion`.
         series: column of the table that tells objects or passes apart.
         motion: the columns are positions.
@@ -54,8 +56,7 @@ def diagnose_noise(
     if columns and len(inputs) != 1:
         raise DataError(f"--columns reads one table, not {len(inputs)}.")
     if reference:
-        config = load_config(config_path)
-        config = config.model_copy(update={"date": parse_date(date)}) if date else config
+        config = load_config(config_path, date=date, framing=framing)
         found = from_recordings(inputs, reference, config, phase)
     else:
         found = from_table(inputs[0], columns, series)

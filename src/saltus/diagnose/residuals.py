@@ -81,7 +81,8 @@ def from_recordings(
         DataError: a file cannot be read, a site is not configured, no address occurs in both, or both say the same.
     """
     seen, truth = (
-        io.read(list(paths), date=config.date, editions=config.editions).plots for paths in (inputs, reference)
+        io.read(list(paths), date=config.date, editions=config.editions, framing=config.framing).plots
+        for paths in (inputs, reference)
     )
     if phase != "all":
         seen = seen.take(seen.on_ground == (1 if phase == "ground" else 0))

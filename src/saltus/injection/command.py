@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus import io
-from saltus.config import Config, load_config, parse_date
+from saltus.config import Config, load_config
 from saltus.demo import write_demo
 from saltus.errors import ModelError
 from saltus.evaluate.plots import OWN_RUN, Followed, Motion, downlinked, followed, from_run, simulated
@@ -37,6 +37,7 @@ def study_faults(
     date: str | None = None,
     reference: Path | None = None,
     seed: int = 0,
+    framing: str | None = None,
 ) -> dict[str, object]:
     """Put faults into 2 % of the radar plots of a recording and see what the tracker makes of them.
 
@@ -50,6 +51,7 @@ def study_faults(
         date: of the recording, YYYY-MM-DD; wins over the configuration's.
         reference: Parquet of the same plots with what aircraft downlinked (BDS 5,0).
         seed: of the faults, and of the simulated scene.
+        framing: of ASTERIX recordings, one of `saltus.framing.NAMES`; None has it guessed.
 
     Returns:
         The metrics, as written.
@@ -62,9 +64,8 @@ def study_faults(
         raise ModelError(f"seed must be >= 0, got {seed}.")
     with output_directory(output) as folder:
         if recordings:
-            config = load_config(config_path)
-            day = parse_date(date) if date else config.date
-            recording = io.read(recordings, date=day, editions=config.editions)
+            config = load_config(config_path, date=date, framing=framing)
+            recording = io.read(recordings, date=config.date, editions=config.editions, framing=config.framing)
             truth = None if reference is None else downlinked(recording.plots, reference)
         else:
             recording, config, truth = _scene(seed)

@@ -7,14 +7,23 @@ from typing import NamedTuple
 
 from saltus.errors import DataError
 from saltus.framing.capture import MAGIC
+from saltus.io.inputs import expand
 from saltus.io.merge import merge
 from saltus.io.part import Part, printable
 from saltus.records import Recording
 
-__all__ = ["FORMATS", "Format", "read", "read_part"]
+__all__ = ["FORMATS", "Format", "Told", "format_of", "read", "read_part"]
 
 Progress = Callable[[str, float], None]
-Reader = Callable[[Path, datetime.date | None, Mapping[int, str], Progress | None], Part]
+Reader = Callable[[Path, "Told", Progress | None], Part]
+
+
+class Told(NamedTuple):
+    """What is told of recordings that they do not tell themselves."""
+
+    date: datetime.date | None = None  # of the first record of ASTERIX files; past midnight counts on
+    editions: Mapping[int, str] = {}  # ASTERIX category -> edition, as "0.23"; categories not named are guessed
+    framing: str | None = None  # one of `saltus.framing.NAMES`; None has it guessed
 
 
 class Format(NamedTuple):
@@ -26,21 +35,21 @@ class Format(NamedTuple):
     reader: Reader
 
 
-def _asterix(path: Path, date: datetime.date | None, editions: Mapping[int, str], progress: Progress | None) -> Part:
+def _asterix(path: Path, told: Told, progress: Progress | None) -> Part:
     from saltus.io.asterix import read_asterix
 
-    return read_asterix(path, date=date, editions=editions, progress=progress)
+    return read_asterix(path, date=told.date, editions=told.editions, framing=told.framing, progress=progress)
 
 
-def _csv(path: Path, date: datetime.date | None, editions: Mapping[int, str], progress: Progress | None) -> Part:
-    del date, editions, progress
+def _csv(path: Path, told: Told, progress: Progress | None) -> Part:
+    del told, progress
     from saltus.io.table import read_csv
 
     return read_csv(path)
 
 
-def _parquet(path: Path, date: datetime.date | None, editions: Mapping[int, str], progress: Progress | None) -> Part:
-    del date, editions, progress
+def _parquet(path: Path, told: Told, progress: Progress | None) -> Part:
+    del told, progress
     from saltus.io.table import read_parquet
 
     return read_parquet(path)
@@ -52,6 +61,7 @@ FORMATS = (
     Format("ASTERIX", (".ast", ".raw", ".asterix"), (), _asterix),
     Format("CSV table", (".csv",), (), _csv),
 )
+_ASTERIX = FORMATS[2]
 
 
 def read(
@@ -59,6 +69,7 @@ def read(
     *,
     date: datetime.date | None = None,
     editions: Mapping[int, str] | None = None,
+    framing: str | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Read files and merge them by time.
@@ -66,10 +77,12 @@ def read(
     The format is told by the first bytes (a whole ASTERIX block among them), else by the suffix.
 
     Args:
-        paths: files; each by its name in messages and in `Plots.files`.
+        paths: files, directories and patterns (`saltus.io.inputs.expand`); each file by its name in messages and in
+            `Plots.files`.
         date: of the first record of ASTERIX files (past midnight counts on). Without it captures use their own
             clock, plain files count from 1970-01-01 and say so among the problems.
         editions: ASTERIX category -> edition, as "0.23"; categories not named are guessed.
+        framing: of ASTERIX files, one of `saltus.framing.NAMES`; None has it guessed.
         progress: called with a file's name and the fraction read.
 
     Raises:
@@ -77,39 +90,41 @@ def read(
     """
     if not paths:
         raise DataError("no input given: name at least one recording.")
-    return merge([read_part(Path(path), date=date, editions=editions, progress=progress) for path in paths])
+    told = Told(date, editions or {}, framing)
+    return merge([read_part(path, told, progress) for path in expand(paths)])
 
 
-def read_part(
-    path: Path,
-    *,
-    date: datetime.date | None = None,
-    editions: Mapping[int, str] | None = None,
-    progress: Progress | None = None,
-) -> Part:
-    """Read one file of those that `saltus.io.merge.merge` joins; arguments and errors are those of `read`."""
-    return printable(_format_of(path).reader(path, date, editions or {}, progress))
+def read_part(path: Path, told: Told, progress: Progress | None = None) -> Part:
+    """Read one file of those that `saltus.io.merge.merge` joins; errors are those of `read`."""
+    return printable(format_of(path, told.framing).reader(path, told, progress))
 
 
-def _format_of(path: Path) -> Format:
+def format_of(path: Path, framing: str | None = None) -> Format:
+    """Tell the format of a file; a framing that is asked for is one of ASTERIX.
+
+    Raises:
+        DataError: the file is empty, a directory or of unknown format.
+    """
     if path.is_dir():
         raise DataError(f"{path}: is a directory; name the files in it.")
     with path.open("rb") as file:
         head = file.read(1 << 17)
     if not head:
         raise DataError(f"{path}: byte 0: the file is empty.")
+    if framing is not None and not head.startswith(FORMATS[0].magic):
+        return _ASTERIX
     for entry in FORMATS:
         if head.startswith(entry.magic):
             return entry
     from saltus.io.blocks import looks_like_asterix
 
     if looks_like_asterix(head):
-        return next(entry for entry in FORMATS if entry.name == "ASTERIX")
+        return _ASTERIX
     for entry in FORMATS:
         if path.suffix.lower() in entry.suffixes:
             return entry
     known = "; ".join(f"{entry.name} ({', '.join(entry.suffixes)})" for entry in FORMATS)
     raise DataError(
         f"{path}: unknown format: it begins with {head[:8].hex(' ')} and not with an ASTERIX block. Known: {known}. "
-        "A recorder's own container must be saved as plain ASTERIX blocks first."
+        "ASTERIX in a recorder's container is recognised by its structure; --framing NAME insists on one."
     )

@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from saltus import io
-from saltus.config import Config, SensorConfig, load_config, parse_date
+from saltus.config import Config, SensorConfig, load_config
 from saltus.errors import DataError
 from saltus.geo import Site
 from saltus.io.write import output_directory
@@ -53,6 +53,7 @@ def track_files(
     time_to: str | None = None,
     *,
     report: bool = True,
+    framing: str | None = None,
 ) -> dict[str, object]:
     """Track recordings and write `tracks.parquet`, `assignments.parquet`, `summary.json` and `report.html`.
 
@@ -65,6 +66,7 @@ def track_files(
         time_from: first time used, HH:MM[:SS] of the recording's day or ISO 8601, UTC.
         time_to: last time used.
         report: whether to write the report; without it, the report of an earlier run is removed.
+        framing: of ASTERIX recordings, one of `saltus.framing.NAMES`; None has it guessed.
 
     Returns:
         The summary, as written.
@@ -74,7 +76,9 @@ def track_files(
         ModelError: the configuration is wrong.
     """
     with progress_bar() as bar, output_directory(output, () if report else (_REPORT,)) as folder:
-        summary, lines = write_tracks(inputs, folder, bar, config_path, date_text, identity, time_from, time_to, report)
+        summary, lines = write_tracks(
+            inputs, folder, bar, config_path, date_text, identity, time_from, time_to, report, framing
+        )
     show_summary(summary, output, report, lines)
     return summary
 
@@ -89,6 +93,7 @@ def write_tracks(
     time_from: str | None = None,
     time_to: str | None = None,
     report: bool = True,
+    framing: str | None = None,
 ) -> tuple[dict[str, object], Sequence[str]]:
     """Track recordings as `track_files` does, into a folder whose files another has yet to publish.
 
@@ -96,9 +101,10 @@ def write_tracks(
         The summary, and lines on what the systems have in common: `show_summary` says both.
     """
     began = time.perf_counter()
-    config = load_config(config_path)
-    day = parse_date(date_text) if date_text else config.date
-    recording = io.read(inputs, date=day, editions=config.editions, progress=bar.reading)
+    config = load_config(config_path, date=date_text, framing=framing)
+    recording = io.read(
+        inputs, date=config.date, editions=config.editions, framing=config.framing, progress=bar.reading
+    )
     decoded = time.perf_counter()
     plots, sensors, problems = _prepare(recording, config, time_from, time_to)
     tracked, whole = track_plots(plots, recording.tracks, sensors, config, bar, use_identity=identity == "use")
