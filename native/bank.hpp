@@ -187,6 +187,60 @@ inline void write_rows(const Tracks& t, Rows rows, const double* log_probs, cons
   }
 }
 
+// The mixture of each group of copies, mode by mode: weights first, then means, then spreads about them. Groups differ in
+// size and their copies lie in any lane, so elements are taken one at a time.
+inline void merge_copies(const Tracks& from, const std::int64_t* start, const double* log_weight, const Tracks& to,
+                         Rows target, Arena arena) {
+  const int n = from.n, record = record_of(from);
+  const Size size = block_of(from);
+  double* share = reinterpret_cast<double*>(arena.base);  // W shares at a time, then the merged record
+  double* merged = share + W;
+  const auto element = [&](const Tracks& t, Size row, Size i) -> double& {
+    return t.data[((row / W) * size + i) * W + row % W];
+  };
+  for (Size g = 0; g < target.count; ++g) {
+    const Size first = start[g], stop = start[g + 1];
+    for (int j = 0; j < from.modes; ++j) {
+      const Size state = from.modes + Size(j) * record;
+      const auto joint = [&](Size c) { return log_weight[c] + element(from, c, j); };
+      double top = -__builtin_inf();
+      for (Size c = first; c < stop; ++c) top = joint(c) > top ? joint(c) : top;
+      if (!(top > -__builtin_inf())) top = 0.0;
+      double sum = 0.0, total = 0.0;
+      for (int i = 0; i < record; ++i) merged[i] = 0.0;
+      // Twice over the copies, W weights at a time: sums of means, then of spreads about the merged mean.
+      for (int pass = 0; pass < 2; ++pass) {
+        for (Size c0 = first; c0 < stop; c0 += W) {
+          const int some = int(stop - c0 < W ? stop - c0 : W);
+          V logs = splat(-__builtin_inf());
+          for (int l = 0; l < some; ++l) logs[l] = joint(c0 + l) - top;
+          store(share, exponential(logs));
+          for (int l = 0; l < some; ++l) {
+            const double w = share[l] + kFloor;
+            if (pass == 0) {
+              sum += share[l], total += w;
+              for (int i = 0; i < n; ++i) merged[i] += w * element(from, c0 + l, state + i);
+              continue;
+            }
+            for (int i = 0; i < n; ++i) {
+              const double away = element(from, c0 + l, state + i) - merged[i];
+              for (int k = 0; k <= i; ++k) {
+                const int at = n + packed(i, k);
+                merged[at] += w / total * (element(from, c0 + l, state + at) +
+                                           away * (element(from, c0 + l, state + k) - merged[k]));
+              }
+            }
+          }
+        }
+        if (pass == 0)
+          for (int i = 0; i < n; ++i) merged[i] /= total;
+      }
+      element(to, target.index[g], j) = logarithm(splat(sum))[0] + top;
+      for (int i = 0; i < record; ++i) element(to, target.index[g], state + i) = merged[i];
+    }
+  }
+}
+
 inline void copy_rows(const Tracks& from, Rows source, const Tracks& to, Rows target) {
   const Size size = block_of(from);
   for (Size r = 0; r < source.count; ++r) {

@@ -84,6 +84,9 @@ struct Kernel {
   // `totals` is scratch, as many doubles as mass, means and covs together.
   void (*bank_merge)(const Tracks&, Rows, const double* weight, const std::int64_t* label, std::ptrdiff_t labels,
                      double* mass, double* means, double* covs, double* totals, double* workspace);
+  // Row i of `to` becomes the mixture of the copies start[i] .. start[i + 1] - 1, whose weights in logs are normalised.
+  void (*bank_merge_copies)(const Tracks& copies, const std::int64_t* start, const double* log_weight, const Tracks& to,
+                            Rows target, double* workspace);
   void (*bank_copy)(const Tracks& from, Rows source, const Tracks& to, Rows target);
   // Does `rounds` x 16 x lanes independent fused multiply-adds: what the core can do at most.
   double (*multiply_adds)(std::int64_t rounds);

@@ -262,6 +262,18 @@ class Bank {
                        covs.data(), totals.data(), space(1));
   }
 
+  void merge_copies(const Index& index, const Bank& copies, const Index& begins, const Array& log_weight) {
+    const std::vector<std::int64_t> to = checked(index), start = numbers(begins);
+    const Size k = Size(to.size()), c = Size(log_weight.size());
+    require(tracks_.n == copies.tracks_.n && tracks_.modes == copies.tracks_.modes && &kernel_ == &copies.kernel_ &&
+                this != &copies,
+            "copies are of another bank of the same n, chains and instruction set.");
+    require(Size(start.size()) == k + 1 && c <= copies.blocks_ * kernel_.lanes, "start is (k + 1,), a copy per weight.");
+    require(start[0] >= 0 && start[k] <= c, "start runs from 0 to the number of copies.");
+    for (Size i = 0; i < k; ++i) require(start[i] < start[i + 1], "every row has a copy.");
+    kernel_.bank_merge_copies(copies.tracks_, start.data(), log_weight.data(), tracks_, {to.data(), k}, space(1));
+  }
+
   void copy_from(const Index& target, const Bank& other, const Index& source) {
     const std::vector<std::int64_t> to = checked(target), from = other.checked(source);
     require(tracks_.n == other.tracks_.n && tracks_.modes == other.tracks_.modes && to.size() == from.size() &&
@@ -326,5 +338,6 @@ NB_MODULE(_native, module) {
            nb::arg(), nb::arg().none(), nb::arg(), nb::arg().noconvert(), nb::arg().noconvert())
       .def("merge", &Bank::merge, rows, nb::arg(), rows, nb::arg().noconvert(), nb::arg().noconvert(),
            nb::arg().noconvert())
+      .def("merge_copies", &Bank::merge_copies, rows, nb::arg(), rows, nb::arg())
       .def("copy_from", &Bank::copy_from, rows, nb::arg(), rows);
 }

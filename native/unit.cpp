@@ -66,6 +66,11 @@ void bank_merge(const Tracks& t, Rows rows, const double* weight, const std::int
   merge_rows(t, rows, weight, label, labels, mass, means, covs, totals, arena(workspace));
 }
 
+void bank_merge_copies(const Tracks& copies, const std::int64_t* start, const double* log_weight, const Tracks& to,
+                       Rows target, double* workspace) {
+  merge_copies(copies, start, log_weight, to, target, arena(workspace));
+}
+
 double multiply_adds(std::int64_t rounds) {
   V sums[16];
   for (int i = 0; i < 16; ++i) sums[i] = splat(double(i));
@@ -81,7 +86,7 @@ double multiply_adds(std::int64_t rounds) {
 
 const Kernel kernel{SALTUS_NAME(SALTUS_NS), W,          filter_workspace, filter,    bank_workspace, block_size,
                     bank_step,              bank_measure, bank_moments,     bank_read, bank_write,     expand_workspace,
-                    bank_expand,            bank_merge,   copy_rows,        multiply_adds};
+                    bank_expand,            bank_merge,   bank_merge_copies, copy_rows,        multiply_adds};
 
 }  // namespace
 }  // namespace saltus::SALTUS_NS

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from oracles import error
-from saltus.errors import ModelError
+from saltus.errors import ModelError, NumericalError
 from saltus.filters import Bank, Belief, imm_filter
-from strategies import quick, random_problem, rngs
+from strategies import law, quick, random_cov, random_problem, rngs
 
 ROUND_OFF = 1e-11
 
@@ -205,14 +205,75 @@ def test_a_mixture_of_noises_is_a_chain_drawn_afresh(rng, sizes, h, n_rows):
         bank.step(rows, transitions(p, k), at(p, "F", k), at(p, "b", k), at(p, "Q", k))
         R = noises[:, k][:, None] * factor.reshape(-1, *(1 for _ in sizes), 1, 1)
         H, d = (None if (a := at(p, name, k)) is None else np.broadcast_to(a, (n_rows, *a.shape[1:])) for name in "Hd")
-        each = bank.score_each(rows, p["z"][:, k], H, d, R)
-        weights = np.broadcast_to(np.log(law), (n_rows, h))
-        log_f, posterior = bank.update_mixture(rows, p["z"][:, k], H, d, R, weights)
+        each = np.repeat(np.arange(n_rows), h)
+        copies = bank.take(rows[each])
+        offset, noise = None if d is None else d[each], R.reshape((-1, *R.shape[2:]))
+        _, log_each = copies.update(np.arange(len(each)), p["z"][each, k], H[each], offset, noise)
+        weights = np.tile(np.log(law), n_rows) + log_each
+        log_f, posterior = bank.merge(rows, copies, h * np.arange(n_rows + 1), weights)
+        posterior = posterior.reshape(n_rows, h)
         mean, cov, probs = bank.moments(rows)
         assert error(mean, est.mean[:, k]) < ROUND_OFF
         assert error(cov, est.cov[:, k]) < ROUND_OFF
         assert error(probs, est.probs[:, k].sum(-1)) < ROUND_OFF
         np.testing.assert_allclose(log_f, est.log_likelihood[:, k], rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(posterior, weights + each - log_f[:, None], rtol=1e-9, atol=1e-9)
         joint = est.probs[:, k].reshape(n_rows, -1, h).sum(1)
         np.testing.assert_allclose(np.exp(posterior), joint, rtol=1e-8, atol=1e-10)
+
+
+@quick
+@given(rngs(), st.lists(st.integers(1, 3), max_size=2), st.lists(st.integers(1, 5), min_size=1, max_size=4))
+def test_ragged_hypotheses_are_mixtures_mode_by_mode(rng, sizes, groups):
+    """Against sums over one mode and one group at a time; copies of the first group may be impossible."""
+    sizes, n = tuple(sizes), 3
+    c, start = sum(groups), np.concatenate([[0], np.cumsum(groups)])
+    probs = law(rng, (c,), int(np.prod(sizes))).reshape((c, *sizes))
+    each = Belief(np.log(probs), rng.normal(size=(c, *sizes, n)), random_cov(rng, (c, *sizes), n))
+    log_weights = 20.0 * rng.normal(size=c)
+    log_weights[1 : groups[0]] = -np.inf
+    copies, bank = Bank(n, sizes, capacity=1), Bank(n, sizes, capacity=9)
+    copies = copies.take(copies.add(each))
+    rows = rng.permutation(9)[: len(groups)]
+    log_f, log_posterior = bank.merge(rows, copies, start, log_weights)
+    got = bank.read(rows)
+    for g, row in enumerate(zip(*got, strict=True)):
+        mine = slice(start[g], start[g + 1])
+        weight = np.exp(log_weights[mine] - log_weights[mine].max())
+        assert log_f[g] == pytest.approx(np.log(weight.sum()) + log_weights[mine].max())
+        weight /= weight.sum()
+        np.testing.assert_allclose(np.exp(log_posterior[mine]), weight, rtol=1e-9)
+        for mode in np.ndindex(*sizes):
+            w = weight * probs[mine][(slice(None), *mode)]
+            x, P = (a[mine][(slice(None), *mode)] for a in each[1:])
+            mean = w @ x / w.sum()
+            second = np.einsum("c,cij->ij", w, P + x[:, :, None] * x[:, None, :]) / w.sum()
+            assert np.exp(row[0][mode]) == pytest.approx(w.sum())
+            np.testing.assert_allclose(row[1][mode], mean, atol=1e-10)
+            np.testing.assert_allclose(row[2][mode], second - np.outer(mean, mean), atol=1e-9)
+
+
+def test_groups_that_do_not_fit_and_rows_without_a_possible_hypothesis(rng):
+    bank = Bank(1, (2,), capacity=4)
+    rows = bank.add(Belief(np.log(np.full((2, 2), 0.5)), np.zeros((2, 2, 1)), np.ones((2, 2, 1, 1))))
+    copies = bank.take(rows[[0, 0, 1]])
+    for start in ([0, 2], [0, 0, 3], [0, 2, 2], [1, 2, 3], [0, 3, 2]):
+        with pytest.raises(ModelError, match=r"groups of copies begin at start \(k \+ 1,\)"):
+            bank.merge(rows, copies, np.array(start), np.zeros(3))
+    before = bank.read(rows)
+    with pytest.raises(NumericalError, match=f"row {rows[1]}: no hypothesis is possible"):
+        bank.merge(rows, copies, np.array([0, 2, 3]), np.array([0.0, 0.0, -np.inf]))
+    for now, then in zip(bank.read(rows), before, strict=True):
+        np.testing.assert_array_equal(now, then)
+    log_f, posterior = bank.merge(rows[:0], bank.take(rows[:0]), np.zeros(1, np.intp), np.zeros(0))
+    assert log_f.shape == posterior.shape == (0,)
+
+
+def test_one_hypothesis_is_the_copy_itself(rng):
+    bank = Bank(2, (2,), capacity=4)
+    rows = bank.add(Belief(np.log([[0.3, 0.7]]), rng.normal(size=(1, 2, 2)), random_cov(rng, (1, 2), 2)))
+    copies = bank.take(rows)
+    expected = bank.read(rows)
+    log_f, posterior = bank.merge(rows, copies, np.array([0, 1]), np.array([-750.0]))
+    assert (log_f, posterior) == (-750.0, 0.0)
+    for now, then in zip(bank.read(rows), expected, strict=True):
+        np.testing.assert_allclose(now, then, rtol=1e-14)

@@ -190,3 +190,49 @@ def test_other_types_and_strides(rng):
         lanes.moments(rows, out[0][:5], *out[1:])
     with pytest.raises(RuntimeError):  # outputs are never copies
         lanes.moments(rows, out[0].astype(np.float32), *out[1:])
+
+
+@some
+@given(
+    rng=rngs(),
+    sizes=st.lists(st.integers(1, 3), max_size=3).map(tuple),
+    n=st.integers(1, 7),
+    groups=st.lists(st.integers(1, 20), min_size=1, max_size=12),
+)
+def test_merged_copies(rng, sizes, n, groups, isa, using):
+    c, start = sum(groups), np.concatenate([[0], np.cumsum(groups)])
+    each = beliefs(rng, c, sizes, n)
+    each.log_probs[rng.random(each.log_probs.shape) < 0.1] = -np.inf
+    log_weights = 50.0 * rng.normal(size=c)
+    log_weights[1 : groups[0]] = -np.inf
+    rows = rng.permutation(40)[: len(groups)]
+    found = []
+    for backend in ("native", "numpy"):
+        with using(isa):
+            copies, bank = (Bank(n, sizes, capacity=40, backend=backend) for _ in range(2))
+        numbers = copies.add(each)
+        copies = copies.take(numbers)
+        found.append((*bank.merge(rows, copies, start, log_weights), *bank.read(rows)))
+    close(found[0][:2], found[1][:2])
+    close([np.exp(found[0][2])], [np.exp(found[1][2])])
+    close(found[0][3:], found[1][3:])
+
+
+def test_copies_that_do_not_fit(rng):
+    bank = Bank(2, (2,), capacity=8, backend="native")
+    rows = bank.add(beliefs(rng, 3, (2,), 2))
+    start, weights = np.array([0, 1, 2, 3]), np.zeros(3)
+    lanes = bank._store._lanes
+    with pytest.raises(ModelError, match="of another bank"):
+        bank.merge(rows, bank, start, weights)
+    with pytest.raises(ModelError, match="of another bank"):
+        bank.merge(rows, Bank(3, (2,), capacity=8, backend="native"), start, weights)
+    copies = bank.take(rows)
+    with pytest.raises(ModelError, match="a copy per weight"):
+        lanes.merge_copies(rows, copies._store._lanes, start, np.zeros(10**6))
+    with pytest.raises(ModelError, match="from 0 to the number"):
+        lanes.merge_copies(rows, copies._store._lanes, start + 1, weights)
+    with pytest.raises(ModelError, match="every row has a copy"):
+        lanes.merge_copies(rows, copies._store._lanes, np.array([0, 2, 1, 3]), weights)
+    with pytest.raises(IndexError, match="not in this bank"):
+        lanes.merge_copies(rows + 1000, copies._store._lanes, start, weights)

@@ -11,7 +11,7 @@ from tracking_scenes import SITE, flights, measured, observed, polar_noise, run
 from saltus.errors import ModelError
 from saltus.geo import Plane
 from saltus.simulate import Leg, Radar, Trajectory, observe
-from saltus.tracks.faults import History, SourceCondition, plot_law
+from saltus.tracks.faults import History, SourceCondition, plot_law, weighty
 from saltus.tracks.health import degraded_intervals, sensor_health
 from saltus.tracks.settings import TrackerSettings
 
@@ -380,3 +380,12 @@ def test_health_counts_by_source_and_component():
     assert found[0].time.tolist() == [2.0, 3.0, 5.0] and found[0].fault.tolist() == [0, 1, 2]
     assert found[1].time.tolist() == [1.0, 4.0] and found[1].fault.tolist() == [1, 0]
     assert found[0].p_degraded.shape == (0, 2) and found[1].intervals == []
+
+
+def test_hypotheses_of_no_weight_are_left_aside():
+    p = np.array([[0.9991, 0.0, 0.0009], [0.5, 0.3, 0.2], [0.0005, 0.3, 0.6995], [0.0, 0.0, 1.0]])
+    each, which, start = weighty(p)
+    assert each.tolist() == [0, 1, 1, 1, 2, 2, 3]
+    assert which.tolist() == [0, 0, 1, 2, 1, 2, 2]
+    assert start.tolist() == [0, 1, 4, 6, 7]
+    assert [part.tolist() for part in weighty(p[:0])] == [[], [], [0]]

@@ -172,8 +172,8 @@ def test_a_garbled_height_is_ignored_and_the_plot_kept(rng):
     assert (np.sort(track) == np.arange(n)).all()
     garbled = found.pairs.plot % 2 == 1
     assert (found.height_used == ~garbled).all()
-    assert np.isnan(found.plan.position[garbled, 2]).all()
-    assert np.isfinite(found.plan.position[~garbled, 2]).all()
+    assert np.isnan(found.plan.z[garbled, 2]).all()
+    assert np.isfinite(found.plan.z[~garbled, 2]).all()
 
 
 def polar(m, site_xy):
@@ -198,7 +198,7 @@ def test_a_faulty_plot_is_explained_for_confirmed_tracks_only(shift, kind):
         moved = np.radians(settings.outlier_azimuth) * np.array([-y, x])
     else:
         moved = settings.outlier_range / np.hypot(x, y) * np.array([x, y])
-    np.testing.assert_allclose(found.plan.cov[0, :2, :2], 25.0**2 * np.eye(2), rtol=1e-12)
+    np.testing.assert_allclose(found.covs[0, 0, :2, :2], 25.0**2 * np.eye(2), rtol=1e-12)
     np.testing.assert_allclose(found.covs[0, kind, :2, :2], 25.0**2 * np.eye(2) + np.outer(moved, moved), rtol=1e-9)
     tentative, _ = gated(AGILE, mean, m, probability=0.9999, status=TENTATIVE)
     assert len(tentative.pairs.plot) == 0

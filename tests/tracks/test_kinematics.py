@@ -6,7 +6,7 @@ from scipy.linalg import block_diag, expm
 
 from saltus.errors import ModelError
 from saltus.filters import imm_filter
-from saltus.tracks.kinematics import Plan, Start, make_kinematics, two_point_start, with_speed_prior
+from saltus.tracks.kinematics import Chosen, Plan, Start, make_kinematics, two_point_start, with_speed_prior
 from saltus.tracks.settings import FilterSettings
 
 STEPS = np.array([4.0, 3.7, 4.4, 8.1, 0.2, 4.0])
@@ -62,10 +62,9 @@ def carried(settings, tracks):
     total = np.zeros((3, len(STEPS)))
     for k, dt in enumerate(STEPS):
         copies = kinematics.predicted(rows[::-1], np.full(3, dt))
-        plan = Plan(position[::-1, k], cov[::-1, k], np.zeros(3))
-        total[::-1, k] = copies.score(np.arange(3), plan, plan.cov[:, None])[:, 0]
-        copies.update(np.arange(3), plan)
-        kinematics.put(rows[::-1], copies, np.arange(3))
+        plan = Plan.of_positions(position[::-1, k], np.zeros(3))
+        total[::-1, k] = copies.score(np.arange(3), plan, cov[::-1, k][:, None])[:, 0]
+        kinematics.absorb(rows[::-1], copies, Chosen.sure(np.arange(3), plan, cov[::-1, k]))
         out.append(kinematics.moments(rows))
     return out, total
 
@@ -217,16 +216,17 @@ def test_a_plot_without_height_leaves_the_height_predicted(tracks):
     predicted = copies.moments(np.arange(3))
     blind = position[:, 0].copy()
     blind[:, 2] = np.nan
-    copies.update(np.arange(3), Plan(blind, cov[:, 0], np.zeros(3)))
-    after = copies.moments(np.arange(3))
+    unchanged = kinematics.moments(rows)  # the originals know nothing of their copies
+    np.testing.assert_allclose(unchanged.mean, start.mean, rtol=1e-12)
+    plan = Plan.of_positions(blind, np.zeros(3))
+    kinematics.absorb(rows, copies, Chosen.sure(np.arange(3), plan, cov[:, 0]))
+    after = kinematics.moments(rows)
     np.testing.assert_allclose(after.mean[:, 4:], predicted.mean[:, 4:], rtol=1e-12)
     np.testing.assert_allclose(after.cov[:, 4:, 4:], predicted.cov[:, 4:, 4:], rtol=1e-12)
     np.testing.assert_allclose(after.p_manoeuvre_v, predicted.p_manoeuvre_v, rtol=1e-12)
     assert (
         np.trace(after.cov[:, :4, :4], axis1=1, axis2=2) < np.trace(predicted.cov[:, :4, :4], axis1=1, axis2=2)
     ).all()
-    unchanged = kinematics.moments(rows)  # the originals know nothing of their copies
-    np.testing.assert_allclose(unchanged.mean, start.mean, rtol=1e-12)
 
 
 def test_a_late_plot_measures_where_the_target_was(tracks):
@@ -236,7 +236,8 @@ def test_a_late_plot_measures_where_the_target_was(tracks):
     kinematics = make_kinematics(FilterSettings(form="joint", **one))
     rows = kinematics.add(start)
     z = np.nan_to_num(position[:, 0])
-    kinematics.update(rows, Plan(z, cov[:, 0], np.full(3, -1.5)))
+    late = Plan.of_positions(z, np.full(3, -1.5))
+    kinematics.absorb(rows, kinematics.predicted(rows, np.zeros(3)), Chosen.sure(np.arange(3), late, cov[:, 0]))
     found = kinematics.moments(rows)
     A = np.zeros((3, 6))
     for axis in range(3):

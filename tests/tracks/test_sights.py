@@ -8,7 +8,7 @@ from tracking_scenes import fed, tracker_of
 
 from saltus.geo import Plane
 from saltus.records import Kind, Plots, Source, System
-from saltus.tracks.kinematics import Start, make_kinematics
+from saltus.tracks.kinematics import Chosen, Start, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Noise, place_plots
 from saltus.tracks.settings import FilterSettings, TrackerSettings
@@ -99,8 +99,8 @@ def test_one_update_is_the_extended_kalman_filter_s(angle, rng):
     expected, expected_cov = x + K[:, 0] * nu, P - K @ H @ P
     m = bearings([dt], [origin], [z + PLANE.factors([origin])[0][0]])
     seen = sight(kinematics, life, m, np.array([0]), GATE)
-    seen.copies.update(seen.copy, seen.plan)
-    moments = seen.copies.moments(seen.copy)
+    kinematics.absorb(seen.pairs.track, seen.copies, Chosen.sure(seen.copy, seen.plan, seen.cov))
+    moments = kinematics.moments(seen.pairs.track)
     np.testing.assert_allclose(moments.mean[0, :4], expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(moments.cov[0, :4, :4], expected_cov, rtol=1e-4, atol=1e-5)
     # Density of the bearing, per radian.
@@ -114,9 +114,10 @@ def test_inflation_widens_the_update_and_no_gate():
     m = bearings([1e-3], origin, [np.pi / 2 + 0.05])
 
     def after(seen_by):
-        seen = sight(*one_track(mean, cov), seen_by, np.array([0]), GATE)
-        seen.copies.update(seen.copy, seen.plan)
-        return seen, seen.copies.moments(seen.copy)
+        kinematics, life = one_track(mean, cov)
+        seen = sight(kinematics, life, seen_by, np.array([0]), GATE)
+        kinematics.absorb(seen.pairs.track, seen.copies, Chosen.sure(seen.copy, seen.plan, seen.cov))
+        return seen, kinematics.moments(seen.pairs.track)
 
     inflated, moments = after(replace(m, inflation=np.array([9.0])))
     _, coarse = after(replace(m, sigma_bearing=np.array([3.0 * SIGMA])))

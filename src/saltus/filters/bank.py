@@ -7,13 +7,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from saltus.errors import ModelError
+from saltus.errors import ModelError, NumericalError
 from saltus.filters import steps
 from saltus.filters.backend import MOST_MODES, MOST_STATES, Backend, use_native
-from saltus.filters.memoryless import merge
+from saltus.filters.memoryless import merge_copies
 from saltus.filters.particles import Merged, Tables, expanded, merged
 from saltus.filters.steps import Belief
-from saltus.linalg import logsumexp
 from saltus.shapes import Float, Int
 
 __all__ = ["Bank", "NumpyStore"]
@@ -133,56 +132,50 @@ class Bank:
         """
         return self._store.measure(rows, z, H, d, R, mode, write=True)
 
-    def score_each(self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array) -> Float[np.ndarray, "k h"]:
-        """Return log f(z) of measurement z[i] for row rows[i] (repeats allowed) under h noise covariances.
+    def merge(
+        self, rows: _Rows, copies: "Bank", start: _Rows, log_weights: _Array
+    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " c"]]:
+        """Make of row rows[i] the mixture of the copies start[i] to start[i + 1] - 1, mode by mode, by moments.
+
+        The one update by hypotheses. Each was carried out on a copy of its row (`take`): predicted to its own
+        measurement's time and conditioned on it, or on none. Hypotheses of one row exclude each other; how many there
+        are may differ from row to row. With l_c = log w_c of a group's copies,
+
+        log f = log sum_c exp l_c,   P(c) = exp(l_c - log f),   P_j = sum_c P(c) P_cj,   x_j, R_j as in `merge_copies`.
 
         Args:
-            rows: k rows.
-            z: (k, m).
-            H: (k, M1|1, ..., m, n).
-            d: (k, M1|1, ..., m) or None.
-            R: (k, h, M1|1, ..., m, m).
-        """
-        h, each = R.shape[1], np.repeat(np.arange(len(rows)), R.shape[1])
-        offset = None if d is None else d[each]
-        _, log_f = self.score(rows[each], z[each], H[each], offset, R.reshape((-1, *R.shape[2:])))
-        return log_f.reshape(-1, h)
-
-    def update_mixture(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, log_weights: _Array
-    ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "k h"]]:
-        """Condition row rows[i] on z[i], whose noise has covariance R[i, a] with probability w[i, a] (no row twice).
-
-        Every pair of mode and covariance is conditioned by itself, weighs P_j w_a f_ja(z), and the axis of the
-        covariances is merged by moments (`memoryless.merge`): the product with a chain that is drawn afresh at every
-        measurement, exact as long as mixing is, at no stored mode.
-
-        Args:
-            rows: k rows.
-            z: (k, m).
-            H: (k, M1|1, ..., m, n).
-            d: (k, M1|1, ..., m) or None.
-            R: (k, h, M1|1, ..., m, m).
-            log_weights: log w, each row's sum of w being 1, (k, h).
+            rows: k rows, none twice.
+            copies: another bank of the same kind; its rows 0, 1, ... are the copies, c of them.
+            start: where each group begins, (k + 1,), from 0 to c, ascending: every row has a hypothesis.
+            log_weights: log P(hypothesis) + log f(its measurement | hypothesis), (c,), or -inf.
 
         Returns:
-            log f(z), and the logarithms of the posterior probabilities of the covariances.
+            log f of each row, and the logarithms of the hypotheses' posterior probabilities.
 
-        Source: theory notes on fusion, sections 4 and 5, with a memoryless chain of h states on the measurement.
+        Raises:
+            ModelError: groups and copies do not fit.
+            NumericalError: all hypotheses of a row are impossible. No row has then been changed.
+
+        Source: theory notes on fusion, sections 4 and 5, with a memoryless chain on each measurement.
         """
-        k, h = log_weights.shape
-        each, every = np.repeat(np.arange(k), h), np.arange(k * h)
-        offset = None if d is None else d[each]
-        copies = self.take(rows[each])
-        _, log_f = copies.update(every, z[each], H[each], offset, R.reshape((-1, *R.shape[2:])))
-        log_joint = log_weights + log_f.reshape(k, h)
-        total = logsumexp(log_joint, (1,))
-        log_posterior = log_joint - total
-        split = Belief(*(a.reshape(k, h, *a.shape[1:]) for a in copies.read(every)))
-        log_probs = split.log_probs + log_posterior.reshape(k, h, *(1 for _ in self.sizes))
-        merged = merge(Belief(log_probs, split.means, split.covs), 0, 1 + len(self.sizes))
-        self.write(rows, Belief(*(a[:, 0] for a in merged)))
-        return total[:, 0], log_posterior
+        size = np.diff(start)
+        if len(start) != len(rows) + 1 or start[0] != 0 or start[-1] != len(log_weights) or (size < 1).any():
+            raise ModelError(
+                f"groups of copies begin at start (k + 1,), ascending from 0 to the number of copies: got {len(rows)} "
+                f"rows, {len(log_weights)} copies and start from {start[:1]} to {start[-1:]}."
+            )
+        if not len(rows):
+            return np.zeros(0), np.zeros(0)
+        group = np.repeat(np.arange(len(rows)), size)
+        top = np.maximum.reduceat(log_weights, start[:-1])
+        if not np.isfinite(top).all():
+            raise NumericalError(
+                f"row {rows[np.argmin(np.isfinite(top))]}: no hypothesis is possible. Give one of them a finite weight."
+            )
+        log_f = top + np.log(np.add.reduceat(np.exp(log_weights - top[group]), start[:-1]))
+        log_posterior = np.asarray(log_weights - log_f[group])
+        self._store.merge(rows, copies._store, start, log_posterior)
+        return log_f, log_posterior
 
     def expand(
         self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables
@@ -244,6 +237,7 @@ class _Store(Protocol):
     def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]: ...
     def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]: ...
     def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged: ...
+    def merge(self, rows: _Rows, copies: Any, start: _Rows, log_weights: _Array) -> None: ...
 
 
 def _make_store(n: int, sizes: tuple[int, ...], capacity: int, backend: Backend | None) -> _Store:
@@ -333,6 +327,10 @@ class NumpyStore:
     def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:
         """Return total weight, mean and covariance of the rows of each label."""
         return merged(self._means[rows], self._covs[rows], weights, labels, n_labels)
+
+    def merge(self, rows: _Rows, copies: "NumpyStore", start: _Rows, log_weights: _Array) -> None:
+        """Overwrite rows with mixtures of another store's rows 0, 1, ..., a group each."""
+        self.write(rows, merge_copies(copies.read(np.arange(len(log_weights))), start, log_weights))
 
 
 def _looked_up(table: _Array, mode: _Modes | None) -> _Array:

@@ -210,6 +210,10 @@ class NativeStore:
         self._lanes.merge(rows, weights, labels, *out)
         return out
 
+    def merge(self, rows: _Rows, copies: "NativeStore", start: _Rows, log_weights: _Array) -> None:
+        """Overwrite rows with mixtures of another store's rows 0, 1, ..., a group each."""
+        self._lanes.merge_copies(rows, copies._lanes, start, log_weights)
+
 
 def _looked_up(table: _Array, mode: _Modes | None) -> Any:
     """A table with the row of it that each row of the bank takes."""

@@ -20,6 +20,7 @@ from saltus.linalg import gaussian_terms, logsumexp, quadratic_form, symmetric
 from saltus.shapes import Bool, Float
 
 __all__ = [
+    "FLOOR",
     "NOT_POSITIVE",
     "Belief",
     "Conditioned",
@@ -38,8 +39,8 @@ NOT_POSITIVE = (
     "an innovation covariance S = H P H' + R is not positive definite: some measured component has "
     "neither noise nor uncertainty. Give every measured component a positive variance in R."
 )
+FLOOR = 1e-290  # keeps the moments of a mode of probability zero defined, and touches nothing else
 _LOG_2PI = float(np.log(2.0 * np.pi))
-_FLOOR = 1e-290  # keeps the moments of a mode of probability zero defined, and touches nothing else
 
 
 class Belief(NamedTuple):
@@ -121,7 +122,7 @@ def _mix_axis(
     joint_ij = t * np.exp(lp - top)[..., None]
     with np.errstate(divide="ignore"):
         lq = np.log(joint_ij.sum(-2)) + top
-    mu = joint_ij + _FLOOR
+    mu = joint_ij + FLOOR
     mu_t = (mu / mu.sum(-2, keepdims=True)).swapaxes(-1, -2)  # (..., j, i)
     xj = mu_t @ x
     spread = x[..., None, :, :] - xj[..., :, None, :]  # (..., j, i, n)

@@ -18,7 +18,7 @@ from saltus.linalg import logsumexp
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import TrackerSettings
 
-__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law"]
+__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law", "weighty"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -28,6 +28,7 @@ _LIVE = 0.01  # probability of a condition from which gates reckon with it
 _OWN_AFFAIR = 0.05  # probability that the error of a plot is its target's own affair and tells nothing of the source
 _LASTING = 4.0  # s that errors of one target last: it is heard once in that time
 _FORGOTTEN, _FEW_HEARD = 60.0, 64  # s, more than plots come late; and tracks that are no burden
+_NEGLIGIBLE = 1e-3  # probability of all hypotheses of a plot that are left aside
 _ROUGH = 0.005  # of positions that transmitters tell err as under a degraded source, each by itself
 
 
@@ -84,6 +85,26 @@ class PlotLaw:
         variance = np.einsum("kai,kij,kaj->ka", direction, R, direction)
         wrong = np.stack([self.outlier[0] * distance, np.minimum(self.outlier[1], _FAULTY_SHARE * distance)], axis=-1)
         return direction[..., :, None] * direction[..., None, :], variance, wrong
+
+
+def weighty(p: _Array) -> tuple[_Index, _Index, _Index]:
+    """Return the fewest hypotheses of each plot that hold all but 1e-3 of its probability.
+
+    The others would move a track by less than that share of their distance.
+
+    Args:
+        p: probabilities, (k, h).
+
+    Returns:
+        Plot and hypothesis of each, sorted by plot, (c,), and where each plot's begin, (k + 1,).
+    """
+    order = np.argsort(-p, axis=1, kind="stable")
+    before = np.cumsum(np.take_along_axis(p, order, axis=1), axis=1)
+    before = np.column_stack([np.zeros(len(p)), before[:, :-1]])
+    keep = np.zeros(p.shape, bool)
+    np.put_along_axis(keep, order, before < 1.0 - _NEGLIGIBLE, axis=1)
+    each, which = np.nonzero(keep)
+    return each, which, np.append(0, np.cumsum(keep.sum(axis=1)))
 
 
 def plot_law(settings: TrackerSettings, *, polar: bool) -> PlotLaw:

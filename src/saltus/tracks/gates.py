@@ -99,7 +99,7 @@ class Gate:
         covs = (source.law.covariances(m, plot) + late[inside, None]) * m.inflation[plot, None, None, None]
         return Gated(
             Pairs(near.track[inside], near.plot[inside]),
-            Plan(z, covs[:, 0], offset[inside]),
+            Plan.of_positions(z, offset[inside]),
             covs,
             y[inside, :2],
             S[inside, :2, :2],

@@ -16,6 +16,7 @@ from saltus.tracks.settings import FilterSettings
 
 __all__ = [
     "Channel",
+    "Chosen",
     "Kinematics",
     "Moments",
     "Plan",
@@ -28,6 +29,8 @@ __all__ = [
 _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
 
+_HEIGHT = 2  # component of a measurement
+
 
 class Moments(NamedTuple):
     """What is published of a row: state (x, vx, y, vy, z, vz), its covariance, probabilities of manoeuvre."""
@@ -39,11 +42,40 @@ class Moments(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Position measurements for rows: x, y, altitude (NaN unknown), covariance, time offset to the row."""
+    """Measurements z = C x + v of states (x, vx, y, vy, z, vz), one for each of k rows.
 
-    position: _Array  # (k, 3)
-    cov: _Array  # (k, 3, 3)
-    offset: _Array  # (k,) s, <= 0: how far the measurement lies before the row's time
+    Two components measure in the plane, the third height: a filter of one takes its own. What is not measured is NaN.
+    """
+
+    z: _Array  # (k, m)
+    C: _Array  # (k, m, 6)
+
+    @classmethod
+    def of_positions(cls, position: _Array, offset: _Array) -> "Plan":
+        """Return measurements of positions (k, 3), offset s (k,) from the time of their row along its velocity."""
+        C, axis = np.zeros((len(position), 3, 6)), np.arange(3)
+        C[:, axis, 2 * axis] = 1.0
+        C[:, axis, 2 * axis + 1] = offset[:, None]
+        return cls(position, C)
+
+    def take(self, index: _Rows) -> "Plan":
+        """Return the measurements selected."""
+        return Plan(self.z[index], self.C[index])
+
+
+class Chosen(NamedTuple):
+    """Hypotheses of k rows, those of row i from start[i] to start[i + 1] - 1."""
+
+    copy: _Rows  # (c,): row of the copy that each is carried out on
+    start: _Rows  # (k + 1,)
+    plan: Plan  # (c,)
+    covs: _Array  # (c, m, m)
+    log_weights: _Array  # (c,)
+
+    @classmethod
+    def sure(cls, copy: _Rows, plan: Plan, covs: _Array) -> "Chosen":
+        """Return the only hypothesis of each row: measurements with covariances (k, m, m)."""
+        return cls(copy, np.arange(len(copy) + 1), plan, covs, np.zeros(len(copy)))
 
 
 class Start(NamedTuple):
@@ -85,33 +117,25 @@ class Channel:
         ahead.step(np.arange(len(rows)), over.trans, over.F, None, over.Q)
         return replace(self, bank=ahead)
 
-    def update(self, rows: _Rows, plan: Plan) -> None:
-        """Condition rows on the measured axes."""
-        z, H = self._measured(plan)
-        self.bank.update(rows, z, H, None, self._noise(plan.cov))
-
-    def update_mixture(self, rows: _Rows, plan: Plan, covs: _Array, log_weights: _Array) -> None:
-        """Condition rows on measurements whose covariances `covs` (k, h, 3, 3) have probabilities w (k, h)."""
-        z, H = self._measured(plan)
-        self.bank.update_mixture(rows, z, H, None, self._noise(covs), log_weights)
-
     def score(self, rows: _Rows, plan: Plan, covs: _Array) -> _Array:
-        """Log-likelihood of the measured axes under h covariances (k, h, 3, 3) of each measurement, (k, h)."""
-        z, H = self._measured(plan)
-        return self.bank.score_each(rows, z, H, None, self._noise(covs))
+        """Log-likelihood of what this channel measures under h covariances (k, h, m, m) of each measurement, (k, h)."""
+        (k, h), each = covs.shape[:2], np.repeat(np.arange(len(rows)), covs.shape[1])
+        _, log_f = self.bank.score(rows[each], *self._measured(plan.take(each), covs.reshape(k * h, *covs.shape[2:])))
+        return log_f.reshape(k, h)
 
-    def _measured(self, plan: Plan) -> tuple[_Array, _Array]:
-        """The measured axes, and the matrix that takes them from the state."""
-        m, each = len(self.axes), np.arange(len(self.axes))
-        H = np.zeros((len(plan.offset), m, 2 * m))
-        H[:, each, 2 * each] = 1.0
-        H[:, each, 2 * each + 1] = plan.offset[:, None]
-        return plan.position[:, self.axes], H.reshape((len(H), *(1 for _ in self.bank.sizes), m, 2 * m))
+    def conditioned(self, rows: _Rows, plan: Plan, covs: _Array) -> tuple[Bank, _Array]:
+        """Return copies of rows (repeats allowed) conditioned on measurements, and log-likelihoods of these, (c,)."""
+        copies = self.bank.take(rows)
+        _, log_f = copies.update(np.arange(len(rows)), *self._measured(plan, covs))
+        return copies, log_f
 
-    def _noise(self, cov: _Array) -> _Array:
-        """Covariances (..., 3, 3) of the measured axes, with an axis for each chain."""
-        R = cov[..., self.axes[:, None], self.axes]
-        return R.reshape((*R.shape[:-2], *(1 for _ in self.bank.sizes), *R.shape[-2:]))
+    def _measured(self, plan: Plan, cov: _Array) -> tuple[_Array, _Array, None, _Array]:
+        """What a bank asks of measurements, and their noise, in this channel."""
+        components = np.array([c for c in range(plan.z.shape[1]) if (c if c == _HEIGHT else 0) in self.axes])
+        lift = (len(plan.z), *(1 for _ in self.bank.sizes))
+        C = plan.C[:, components[:, None], self.states]
+        R = cov[:, components[:, None], components]
+        return plan.z[:, components], C.reshape((*lift, *C.shape[1:])), None, R.reshape((*lift, *R.shape[1:]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,28 +180,24 @@ class Kinematics:
         parts = zip(self.channels, self.intervals.at(dt), strict=True)
         return Kinematics(tuple(channel.predicted(rows, over) for channel, over in parts), self.intervals)
 
-    def update(self, rows: _Rows, plan: Plan) -> None:
-        """Condition rows on measurements."""
-        for channel in self.channels:
-            channel.update(rows, plan)
-
-    def update_mixture(self, rows: _Rows, plan: Plan, covs: _Array, log_weights: _Array) -> None:
-        """Condition rows on measurements whose covariance in the plane has h candidates.
+    def absorb(self, rows: _Rows, copies: "Kinematics", chosen: "Chosen") -> None:
+        """Make of each row the mixture of its hypotheses, each a copy of the row conditioned on a measurement.
 
         Args:
             rows: k rows, none twice.
-            plan: the measurements; its covariances serve where the plane is not measured.
-            covs: (k, h, 3, 3).
-            log_weights: logarithms of their probabilities, (k, h).
+            copies: rows moved to the measurements' times.
+            chosen: the hypotheses of each row.
         """
-        for channel in self.channels:
-            if 0 in channel.axes:
-                channel.update_mixture(rows, plan, covs, log_weights)
-            else:
-                channel.update(rows, plan)
+        parts = [channel.conditioned(chosen.copy, chosen.plan, chosen.covs) for channel in copies.channels]
+        log_weights = chosen.log_weights + sum(log_f for _, log_f in parts)
+        for channel, (conditioned, _) in zip(self.channels, parts, strict=True):
+            channel.bank.merge(rows, conditioned, chosen.start, log_weights)
 
     def score(self, rows: _Rows, plan: Plan, covs: _Array) -> _Array:
-        """Return log-likelihoods of measurements under each of h covariances in the plane, (k, h); repeats allowed."""
+        """Return log-likelihoods of measurements under each of h covariances (k, h, m, m); repeats allowed.
+
+        The covariances of one measurement differ in the plane alone.
+        """
         parts = [channel.score(rows, plan, covs if 0 in channel.axes else covs[:, :1]) for channel in self.channels]
         return np.asarray(sum(parts))
 

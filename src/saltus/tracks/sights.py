@@ -15,7 +15,6 @@ __all__ = ["Sighted", "sight"]
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
-_LOOSE = 1e6  # variance along the line of sight, times that of the track: the range learns nothing
 _LATEST = -2.0  # s: how far a bearing may lie before its track's last update
 
 
@@ -23,9 +22,10 @@ class Sighted(NamedTuple):
     """Pairs of confirmed tracks and bearings inside their gates, with a copy of each pair's track at that time."""
 
     pairs: Pairs  # rows of the bank, positions in the slice
-    plan: Plan  # a point on the line of sight, loose along it
+    plan: Plan  # one component: the distance across the line of sight
+    cov: _Array  # (P, 3, 3)
     centre: _Array  # (P, 2), predicted position, m
-    cov: _Array  # (P, 2, 2), of the predicted position, m^2
+    centre_cov: _Array  # (P, 2, 2), of the predicted position, m^2
     log_f: _Array  # (P,): log density of the bearing, per rad
     copies: Kinematics
     copy: _Index  # (P,): row of each pair among the copies
@@ -39,8 +39,7 @@ def sight(kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Inde
 
         0 = c'(x - o) + rho v,   innovation -c'(y - o),  variance c'P c + (rho sigma)^2.
 
-    It is exact in the angle (no wrapping is met), and reaches the filter as the foot of y on the line of sight with
-    covariance f (rho sigma)^2 c c' + L u u', f the source's inflation and L a million times the track's own variance.
+    It is exact in the angle (no wrapping is met); the filter takes the variance times the source's inflation.
 
     Args:
         kinematics: the filters of all tracks.
@@ -64,21 +63,22 @@ def sight(kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Inde
     sigma = rho * m.sigma_bearing[plot]
     S = np.einsum("ki,kij,kj->k", c, P, c) + sigma**2
     inside = np.flatnonzero((rho > 0.0) & (aside**2 <= gate * S))
-    u, c, rho, sigma, offset = u[inside], c[inside], rho[inside], sigma[inside], offset[inside]
+    c, rho, sigma, offset = c[inside], rho[inside], sigma[inside], offset[inside]
     mixture = copies.moments(inside)
     P = mixture.cov[:, :3:2, :3:2]
     S = np.einsum("ki,kij,kj->k", c, P, c) + sigma**2
     d2 = _along(mixture.mean, offset, m.origin[plot[inside]], c) ** 2 / S
-    loose = _LOOSE * (np.trace(P, axis1=1, axis2=2) + sigma**2)
     sigma = sigma * np.sqrt(m.inflation[plot[inside]])
-    z, R = np.full((len(inside), 3), np.nan), np.zeros((len(inside), 3, 3))
-    z[:, :2] = m.origin[plot[inside]] + rho[:, None] * u
-    R[:, :2, :2] = sigma[:, None, None] ** 2 * _outer(c) + loose[:, None, None] * _outer(u)
-    R[:, 2, 2] = 1.0
+    z, C = np.full((len(inside), 3), np.nan), np.zeros((len(inside), 3, 6))
+    z[:, 0] = (c * m.origin[plot[inside]]).sum(axis=-1)
+    C[:, 0, :3:2], C[:, 0, 1:4:2] = c, offset[:, None] * c
+    R = np.tile(np.eye(3), (len(inside), 1, 1))
+    R[:, 0, 0] = sigma**2
     centre = mixture.mean[:, :3:2] + offset[:, None] * mixture.mean[:, 1:4:2]
     return Sighted(
         Pairs(near.track[inside], near.plot[inside]),
-        Plan(z, R, offset),
+        Plan(z, C),
+        R,
         centre,
         P,
         np.log(rho) - 0.5 * (d2 + np.log(2.0 * np.pi * S)),
@@ -113,7 +113,3 @@ def _along(mean: _Array, offset: _Array, origin: _Array, direction: _Array) -> _
     """Component of the position seen from the observer."""
     position = mean[:, :3:2] + offset[:, None] * mean[:, 1:4:2]
     return np.asarray(((position - origin) * direction).sum(axis=-1))
-
-
-def _outer(v: _Array) -> _Array:
-    return np.asarray(v[:, :, None] * v[:, None, :])

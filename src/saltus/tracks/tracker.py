@@ -9,11 +9,11 @@ import numpy.typing as npt
 from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
 from saltus.tracks.background import densities
-from saltus.tracks.faults import SourceCondition, plot_law
+from saltus.tracks.faults import SourceCondition, plot_law, weighty
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.kept import Kept
-from saltus.tracks.kinematics import Plan, make_kinematics
+from saltus.tracks.kinematics import Chosen, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.publish import Told, coasted_rows, updated_rows
@@ -30,7 +30,6 @@ _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
 _SURPLUS = 1.5  # periods between two right plots, below which none is missing between them
-_NEGLIGIBLE = 1e-3  # probability of all other hypotheses of a plot that is taken for right
 _STANDING = np.array([-3.0, -2.0, 0.0])  # nats: a plot is less likely a seed's or a tentative track's own
 
 
@@ -231,37 +230,28 @@ class Tracker:
         return self._last.of(rows[~np.isin(life.plot[rows], life.plot[live[life.status[live] == SEED]])])
 
     def _update(self, rows: _Index, gated: Gated, pairs: _Index, log_weights: _Array, p: _Array) -> None:
-        """Condition tracks on the plots chosen, each a mixture of what may be wrong with it.
-
-        A plot that is right but for a probability of 1e-3 moves its track as a right one: the other hypotheses would
-        move it by less than that share of its distance.
-        """
-        mixed = p[:, 0] < 1.0 - _NEGLIGIBLE
-        for which, several in ((~mixed, False), (mixed, True)):
-            at = pairs[which]
-            if not len(at):
-                continue
-            plan = Plan(*(column[at] for column in gated.plan))
-            if several:
-                gated.copies.update_mixture(gated.copy[at], plan, gated.covs[at], log_weights[which])
-            else:
-                gated.copies.update(gated.copy[at], plan)
-        self._kinematics.put(rows, gated.copies, gated.copy[pairs])
+        """Condition tracks on the plots chosen, each a mixture of what may be wrong with it."""
+        each, which, start = weighty(p)
+        pair = pairs[each]
+        hypotheses = Chosen(
+            gated.copy[pair], start, gated.plan.take(pair), gated.covs[pair, which], log_weights[each, which]
+        )
+        self._kinematics.absorb(rows, gated.copies, hypotheses)
 
     def _sight(self, index: _Index) -> None:
         """Absorb the bearings of one source in one slice: they update confirmed tracks, and do nothing else."""
         settings, m, life = self._settings, self._m, self._life
         seen = sight(self._kinematics, life, m, index, self._gate.height)
-        seen.copies.update(seen.copy, seen.plan)
         detection = settings.detection_probability
         gain = seen.log_f - np.log(settings.clutter_density_azimuth) + np.log(detection / (1.0 - detection))
         chosen = assign(seen.pairs, gain)
         rows, plots = seen.pairs.track[chosen], index[seen.pairs.plot[chosen]]
-        self._kinematics.put(rows, seen.copies, seen.copy[chosen])
+        sure = Chosen.sure(seen.copy[chosen], seen.plan.take(chosen), seen.cov[chosen])
+        self._kinematics.absorb(rows, seen.copies, sure)
         life.sighted(rows, m.time[plots])
         self._track_id[plots] = life.id[rows]
         nothing, none = np.full(len(rows), np.nan), np.zeros(len(rows), np.int8)
-        self._publish(rows, plots, Told(seen.centre[chosen], seen.cov[chosen], nothing, none, np.nan))
+        self._publish(rows, plots, Told(seen.centre[chosen], seen.centre_cov[chosen], nothing, none, np.nan))
 
     def _gain(self, gated: Gated, index: _Index, log_f: _Array) -> _Array:
         """Log-likelihood ratio of "this plot is this track's" against "the track missed and the plot is new"."""
