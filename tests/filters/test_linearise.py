@@ -92,9 +92,9 @@ def test_cubature_mean_of_a_quadratic_is_exact():
     assert np.abs(sensor_joint(mean, cov, sensor, "extended").y - joint.y).max() > 0.5
 
 
-def posterior(sensor, mean, cov, z):
+def posterior(sensor, mean, cov, z, points=801):
     """Mean, covariance, log f(z) and mode of a belief in the plane, by summation over a grid of 7 sigmas."""
-    root, grid = np.linalg.cholesky(cov), np.linspace(-7, 7, 801)
+    root, grid = np.linalg.cholesky(cov), np.linspace(-7, 7, points)
     u = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
     x = mean + u @ root.T
     misfit = sensor.residual(z, sensor.h(x)) / np.sqrt(np.diag(sensor.R))
@@ -260,6 +260,69 @@ def test_iterations_never_leave_a_worse_fit(rng):
     assert np.quantile(fits[-1], 0.99) < 0.05 * np.quantile(fits[0], 0.99)
 
 
+def divergence(sensor, mean, cov, z, q, evidence):
+    """KL(q, exact posterior) by 41 x 41 Gauss-Hermite nodes of q, given the grid's log f(z)."""
+    nodes, weights = np.polynomial.hermite_e.hermegauss(41)
+    u, w = np.stack(np.meshgrid(nodes, nodes), axis=-1).reshape(-1, 2), np.outer(weights, weights).ravel() / (2 * np.pi)
+    x = q.mean + u @ np.linalg.cholesky(q.cov).T
+    misfit = sensor.residual(z, sensor.h(x)) / np.sqrt(np.diag(sensor.R))
+    off = np.linalg.solve(np.linalg.cholesky(cov), (x - mean).T)
+    log_joint = -0.5 * (off**2).sum(0) - 0.5 * (misfit**2).sum(1)
+    log_joint -= 0.5 * np.linalg.slogdet(2 * np.pi * cov)[1] + 0.5 * np.linalg.slogdet(2 * np.pi * sensor.R)[1]
+    return evidence - w @ log_joint - 0.5 * np.linalg.slogdet(2 * np.pi * np.e * q.cov)[1]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("sensor", [PolarSensor(sigma_range=5.0, sigma_azimuth=0.05), PolarSensor(sigma_range=8.0)])
+def test_iterating_is_never_worse_than_not(sensor, method, rng):
+    # A hundred metres away, known to between 5 and 60 m, against the posterior summed over a grid: the divergence
+    # from it falls in every scene (a tenth is what four points of a bent posterior mistake), and on average the
+    # distance of the mean, in exact standard deviations, does not grow (of the arc of a range it is 0.2 either way).
+    plain, iterated, sd = [], [], np.sqrt(np.diag(sensor.R))
+    for _ in range(25):
+        angle, root = rng.uniform(-np.pi, np.pi), rng.normal(size=(2, 2)) * rng.uniform(5, 30)
+        mean, cov = 100 * np.array([np.sin(angle), np.cos(angle)]), root @ root.T + 9 * np.eye(2)
+        z = sensor.h(mean + np.linalg.cholesky(cov) @ rng.normal(size=2)) + sd * rng.normal(size=len(sd))
+        centre, exact_cov, evidence, _ = posterior(sensor, mean, cov, z, points=401)
+        white = np.linalg.inv(np.linalg.cholesky(exact_cov))
+        for k, into in ((1, plain), (2, iterated), (4, iterated)):
+            _, q = update(sensor, mean, cov, z, method=method, iterations=k)
+            into.append((divergence(sensor, mean, cov, z, q, evidence), np.linalg.norm(white @ (q.mean - centre))))
+    before, after = np.array(plain)[:, None], np.array(iterated).reshape(-1, 2, 2)
+    assert (after[..., 0] <= 1.1 * before[..., 0] + 0.01).all()
+    assert (after.mean(0) <= before.mean(0) + np.array([0.0, 0.02])).all()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_iterating_over_many_bearings_of_a_turning_observer(method, rng):
+    # Sixty runs of sixty bearings of 0.02 rad from an observer that turns across the line of sight. Undamped steps
+    # made of a median error of 0.4 km 0.8, and of a NEES of 2.5 (4 expected) 6 and 26.
+    n, dt, sigma = 60, 20.0, 0.02
+    legs = np.array([[0.0, 5.0] if k // 15 % 2 == 0 else [5.0, 0.0] for k in range(60)])
+    own = np.concatenate([np.zeros((1, 2)), np.cumsum(legs[:-1] * dt, axis=0)])
+    start = (1e4 + 2e3 * rng.normal(size=(n, 1))) * [np.sin(0.7), np.cos(0.7)]
+    velocity, bearing = 4.0 * rng.normal(size=(n, 2)), 0.7 + sigma * rng.normal(size=n)
+    along = np.stack([np.sin(bearing), np.cos(bearing)], axis=-1)
+    across = along[:, ::-1] * [1.0, -1.0]
+    means, covs = np.zeros((n, 4)), np.zeros((n, 4, 4))
+    means[:, ::2], covs[:, 1, 1], covs[:, 3, 3] = 1e4 * along, 16.0, 16.0
+    covs[:, ::2, ::2] = 2e3**2 * along[:, :, None] * along[:, None] + 200.0**2 * across[:, :, None] * across[:, None]
+    F, Q, _ = constant_velocity(2, accel=1e-3, kind="white").bind([]).step(np.array(dt), None)
+    seen = [start + velocity * dt * k - own[k] for k in range(60)]
+    z = [np.arctan2(*line.T)[:, None] + sigma * rng.normal(size=(n, 1)) for line in seen]
+    errors, nees = {}, {}
+    for iterations in (1, 3):
+        x, P = means, covs
+        for k in range(1, 60):
+            x, P = steps.propagate(x, P, F, None, Q) if k > 1 else (x, P)
+            sensor = PolarSensor(sigma_azimuth=sigma, observer=Observer(own[k]))
+            x, P = update(sensor, x, P, z[k], method=method, iterations=iterations)[1][:2]
+        off = x - np.stack([start + velocity * dt * 59, velocity], axis=-1).reshape(n, 4)
+        errors[iterations] = np.median(np.hypot(off[:, 0], off[:, 2]))
+        nees[iterations] = np.einsum("ki,kij,kj->k", off, np.linalg.inv(P), off).mean()
+    assert errors[3] < 1.2 * errors[1] and nees[3] < 4.0
+
+
 def test_singular_covariances(rng):
     root = rng.normal(size=(30, 5, 3))
     P = root @ root.swapaxes(-1, -2) * np.outer([1, 1e3, 1e-3, 1, 1], [1, 1e3, 1e-3, 1, 1])
@@ -307,7 +370,7 @@ def test_two_bearings_triangulate(rng):
 def simulated_nees(rng, method, factor, n_runs=400, n_steps=25, dt=2.0):
     """NEES after `n_steps` of range and azimuth, in n_runs at once; the filter's Q is `factor` times the true one."""
     sensor = PolarSensor(sigma_range=20.0, sigma_azimuth=0.02)
-    F, Q, _ = constant_velocity(2, accel=2.0).bind([]).step(np.array(dt), None)
+    F, Q, _ = constant_velocity(2, accel=2.0, kind="scan").bind([]).step(np.array(dt), None)
     mean, cov = (
         np.array([-3e3, 150.0, -4e3, 20.0]),
         np.diag([400.0, 30.0, 400.0, 30.0]) ** 2,
