@@ -26,7 +26,7 @@ system = "platform"               # optional: sources of one system make common 
 [tracker]                         # fields of saltus.tracks.settings.TrackerSettings
 [filter]                          # fields of saltus.tracks.settings.FilterSettings
 [systems]                         # fields of saltus.tracks.settings.SystemsSettings
-[registration]                    # fields of saltus.tracks.registration.RegistrationSettings
+[registration]                    # fields of saltus.tracks.settings.RegistrationSettings
 """
 
 import dataclasses
@@ -45,8 +45,7 @@ from saltus.io.layout import categories
 from saltus.records import System
 from saltus.text import brief, cut, shown
 from saltus.toml import load_toml
-from saltus.tracks.registration import RegistrationSettings
-from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
+from saltus.tracks.settings import FilterSettings, RegistrationSettings, SystemsSettings, TrackerSettings
 
 __all__ = ["Config", "SensorConfig", "load_config", "parse_date"]
 

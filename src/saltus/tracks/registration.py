@@ -1,67 +1,21 @@
 """Biases of one system against another over time, from the objects that both see."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from saltus.errors import ModelError
 from saltus.identify import PairSettings, candidate_pairs
 from saltus.tracks.bias import PARAMETERS, BiasSeries, effects, spread
 from saltus.tracks.bias_fit import Fit, fit_biases, unknown
 from saltus.tracks.common_objects import accept_pairs
 from saltus.tracks.encounters import Blocks, SystemTracks, encounters
+from saltus.tracks.settings import RegistrationSettings
 
 __all__ = ["Registration", "RegistrationSettings", "register"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class RegistrationSettings:
-    """What biases to expect between systems, and how fast they may change.
-
-    Attributes:
-        sigma_offset: standard deviation of a position offset, each axis, m, before anything is known.
-        sigma_azimuth: of an azimuth bias, degrees.
-        sigma_range: of a range bias, m.
-        sigma_range_scale: of a range scale error, as a share of range.
-        sigma_time: of a time stamp bias, s.
-        scatter: expected standard deviation of the offset between objects (antenna, reflector), each axis, m; the
-            data correct it.
-        block: s that errors of reports last: so long a stretch of a track counts as one residual.
-        interval: s between two estimates.
-        memory: s after which residuals are forgotten.
-        widening: factor of a standard deviation that telling parameters apart may cost; what costs more is not
-            separable by the geometry and not estimated.
-    """
-
-    sigma_offset: float = 50.0
-    sigma_azimuth: float = 1.0
-    sigma_range: float = 50.0
-    sigma_range_scale: float = 2e-4
-    sigma_time: float = 0.5
-    scatter: float = 5.0
-    block: float = 10.0
-    interval: float = 30.0
-    memory: float = 3600.0
-    widening: float = 1.3
-
-    def __post_init__(self) -> None:
-        """Refuse settings that cannot be."""
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if not 0.0 < value < np.inf:
-                raise ModelError(f"registration.{name} must be positive and finite, got {value}.")
-
-    @property
-    def prior(self) -> _Array:
-        """Standard deviations in the order and units of `PARAMETERS`."""
-        azimuth = float(np.radians(self.sigma_azimuth))
-        offset = self.sigma_offset
-        return np.array([offset, offset, azimuth, self.sigma_range, self.sigma_range_scale, self.sigma_time])
 
 
 class Registration(NamedTuple):
