@@ -150,6 +150,13 @@ double* output(const nb::handle& array, std::size_t size, const char* name) {
   return out.data();
 }
 
+// (tracks, 3): kind, row, component.
+saltus::Fault* faults(const nb::handle& array, Size tracks) {
+  const auto out = nb::cast<nb::ndarray<std::int64_t, nb::c_contig, nb::device::cpu>>(array, false);
+  require(Size(out.size()) == 3 * tracks, "faults has the wrong size for its output.");
+  return reinterpret_cast<saltus::Fault*>(out.data());
+}
+
 void check_sizes(Size n, Size m) {
   require(n >= 1 && n <= kMostStates && m >= 1 && m <= kMostMeasured,
           "the compiled kernel takes 1 to 256 states and measured components; use backend=\"numpy\".");

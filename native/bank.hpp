@@ -87,14 +87,23 @@ inline void step_rows(const Tracks& t, Rows rows, const Model* trans, const Mode
   }
 }
 
-inline int measure_rows(const Tracks& t, Rows rows, bool write, int m, const double* z, const Model& H, const Model& d,
+// Keep the first fault of the lanes given up of a group that begins with row `first`.
+inline void note(Fault& fault, I lanes, const V* report, int modes, int m, Size first, int count) {
+  for (int l = 0; l < count && fault.kind == kFine; ++l)
+    if (lanes[l]) {
+      fault = fault_of(report, modes, m, l);
+      fault.row = first + l;
+    }
+}
+
+inline Fault measure_rows(const Tracks& t, Rows rows, bool write, int m, const double* z, const Model& H, const Model& d,
                         const Model& R, double* d2, double* log_likelihood, Arena arena) {
   V *copy, *law, *heap;
   arena.used = bank_space(t, m, arena, &copy, &law, &heap);
   V *report = arena.take(std::size_t(t.modes) * report_size(m)), *value = arena.take(m), *on = arena.take(m);
   V* models = arena.base + arena.used;
   const Stages steps = stages(t.n, m);
-  int status = kFine;
+  Fault fault{};
   for (Size first = 0; first < rows.count; first += W) {
     const Group group(t, rows, first, copy);
     const Model measured{z, nullptr, m, 0, 1, m, nullptr};
@@ -110,11 +119,13 @@ inline int measure_rows(const Tracks& t, Rows rows, bool write, int m, const dou
     const ByMode<V> r = staged(R, first, rows.count, free);
     const I bad = (write ? steps.lanes.update : steps.lanes.score)(group.belief + t.modes, t.n, m, t.modes, h, o, r, value,
                                                              on, report, heap);
-    if (any(bad)) status |= kNotPositive;
+    if (any(bad)) note(fault, bad, report, t.modes, m, first, group.lanes);
     if (t.modes == 1) {  // one Gaussian has no law to reweigh, and is its own mixture
       V log_det{};
       for (int a = 0; a < m; ++a) log_det += logarithm(report[2 + a]);
       const V likelihood = -0.5 * (report[0] + log_det + seen * kLog2Pi);
+      const I lost = lost_lanes(likelihood, write);
+      if (any(lost)) note(fault, lost, report, 1, m, first, group.lanes);
       for (int l = 0; l < group.lanes; ++l) d2[first + l] = report[0][l], log_likelihood[first + l] = likelihood[l];
       if (write) group.write_back();
       continue;
@@ -124,13 +135,15 @@ inline int measure_rows(const Tracks& t, Rows rows, bool write, int m, const dou
     probabilities(law, logs, t.modes, law + t.modes);
     const V distance = steps.nis(report, law + t.modes, m, t.modes, heap);
     const V likelihood = reweigh(law, logs, t.modes, m, report, seen, heap);
+    const I lost = lost_lanes(likelihood, write);
+    if (any(lost)) note(fault, lost, report, t.modes, m, first, group.lanes);
     for (int l = 0; l < group.lanes; ++l) d2[first + l] = distance[l], log_likelihood[first + l] = likelihood[l];
     if (!write) continue;
     if (!logs) into_logs(law, t.modes);
     for (int j = 0; j < t.modes; ++j) group.belief[j] = law[j];
     group.write_back();
   }
-  return status;
+  return fault;
 }
 
 inline void moments_of_rows(const Tracks& t, Rows rows, double* mean, double* cov, double* probs, Arena arena) {

@@ -18,7 +18,13 @@ struct Model {
 
 // kDoubtful: a model array given per track holds NaN, inf, or a covariance that is not exactly symmetric or has a
 // negative diagonal. Such arrays are too large to be read twice, so they are checked as they are loaded.
-enum Status : int { kFine = 0, kNotPositive = 1, kInfinite = 2, kDoubtful = 4 };
+// kNotPositive, kTooFar, kNotFinite: a row that has no likelihood, as its Fault says.
+enum Status : int { kFine = 0, kNotPositive = 1, kInfinite = 2, kDoubtful = 4, kTooFar = 8, kNotFinite = 16 };
+
+// Why a track was given up, and where: one Status, the row, the component. Three columns, so that they are an array.
+struct Fault {
+  std::int64_t kind, row, component;
+};
 
 struct Problem {
   std::ptrdiff_t n_tracks = 0, n_steps = 0;
@@ -38,6 +44,7 @@ struct Problem {
   // (tracks, rows, ...); the modes' moments are null unless wanted, log_likelihood always has every row.
   double *probs = nullptr, *mean = nullptr, *cov = nullptr, *log_likelihood = nullptr, *nis = nullptr;
   double *n_observed = nullptr, *mode_means = nullptr, *mode_covs = nullptr;
+  Fault* faults = nullptr;  // (tracks,), of the first row that had one
 };
 
 // Tracks in lanes: block r / lanes holds [log P(modes) | a record per mode], each element once per lane.
@@ -70,15 +77,16 @@ struct Kernel {
   std::size_t (*block_size)(const Tracks&);  // doubles
   void (*bank_step)(const Tracks&, Rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
                     double* workspace);
-  // Measures rows, and conditions them when `write`; z is (count, m), d2 and log_likelihood (count,).
-  int (*bank_measure)(const Tracks&, Rows, bool write, int m, const double* z, const Model& H, const Model& d,
+  // Measures rows, and conditions them when `write`; z is (count, m), d2 and log_likelihood (count,). Returns the first
+  // fault; a row that is only measured may be too far away, with a log-likelihood of -inf.
+  Fault (*bank_measure)(const Tracks&, Rows, bool write, int m, const double* z, const Model& H, const Model& d,
                       const Model& R, double* d2, double* log_likelihood, double* workspace);
   void (*bank_moments)(const Tracks&, Rows, double* mean, double* cov, double* probs, double* workspace);
   void (*bank_read)(const Tracks&, Rows, double* log_probs, double* means, double* covs, double* workspace);
   void (*bank_write)(const Tracks&, Rows, const double* log_probs, const double* means, const double* covs);
   std::size_t (*expand_workspace)(const Tracks&, int modes, int m);
-  // z is (count, m), law (count, modes), log_likelihood (count,).
-  int (*bank_expand)(const Tracks&, Rows, const Branches&, int m, const double* z, const Model& F, const Model& b,
+  // z is (count, m), law (count, modes), log_likelihood (count,). A row may be too far away for every mode.
+  Fault (*bank_expand)(const Tracks&, Rows, const Branches&, int m, const double* z, const Model& F, const Model& b,
                      const Model& Q, const Model& H, const Model& d, const Model& R, double* law,
                      double* log_likelihood, double* workspace);
   // `totals` is scratch, as many doubles as mass, means and covs together.

@@ -42,6 +42,8 @@ SALTUS_INLINE bool any(I mask) {
 #endif
 }
 
+SALTUS_INLINE I finite(V a) { return a - a == 0.0; }
+
 // 1 / a for normal a, to the last bit or two. Where the machine guesses it to 2^-14, two Newton steps, which double the
 // digits, are several times cheaper than a division, and may overlap.
 SALTUS_INLINE V reciprocal(V a) {

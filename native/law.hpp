@@ -1,6 +1,7 @@
 // P(modes) of the lanes of one block, linear while that is safe and in logs when it is not.
 #pragma once
 
+#include "kernel.hpp"
 #include "measure.hpp"
 
 namespace saltus::SALTUS_NS {
@@ -55,12 +56,13 @@ inline V reweigh_logs(V* law, int modes, int m, const V* report, V seen) {
     law[j] -= 0.5 * (report[0] + log_det);
     top = maximum(top, law[j]);
   }
-  top = select(top > -1e300, top, V{});
+  // The greatest first: at 1e16 the logarithm of the sum is rounded to 2, and nothing would sum to 1.
+  top = select(top > -__builtin_inf(), top, V{});
   V sum{};
-  for (int j = 0; j < modes; ++j) sum += exponential(law[j] - top);
-  const V total = logarithm(sum) + top;
+  for (int j = 0; j < modes; ++j) sum += exponential(law[j] -= top);
+  const V total = logarithm(sum);
   for (int j = 0; j < modes; ++j) law[j] -= total;
-  return total - 0.5 * seen * kLog2Pi;
+  return total + top - 0.5 * seen * kLog2Pi;
 }
 
 // law <- P(modes | z), returns log f(z): 0 where nothing was seen. `heap` holds one number per mode.
@@ -73,6 +75,32 @@ inline V reweigh(V* law, bool& logs, int modes, int m, const V* report, V seen, 
     evidence = reweigh_logs(law, modes, m, report, seen);
   }
   return select(seen > 0.0, evidence, V{});
+}
+
+// Why lane l of a measured row has no likelihood, by the reports of its modes.
+inline Fault fault_of(const V* report, int modes, int m, int l) {
+  int component = 0;
+  double least = __builtin_inf();
+  const int size = report_size(m);
+  for (const V* r = report; r < report + modes * size; r += size) {
+    double worst = -1.0;
+    int at = 0;
+    for (int a = 0; a < m; ++a) {
+      const double nu = r[2 + m + a][l], S = r[2 + 2 * m + packed(a, a)][l], away = __builtin_fabs(nu) / __builtin_sqrt(S);
+      if (!(nu - nu == 0.0) || !(S - S == 0.0)) return {kNotFinite, 0, a};
+      if (!(r[2 + a][l] > 0.0)) return {kNotPositive, 0, a};
+      if (away > worst) worst = away, at = a;
+    }
+    if (worst < least) least = worst, component = at;
+  }
+  return {kTooFar, 0, component};
+}
+
+// Lanes whose row has no likelihood: as a rule too far counts, where it is only looked at it does not.
+inline I lost_lanes(V log_likelihood, bool too_far) {
+  I lost = ~finite(log_likelihood);
+  if (!too_far) lost &= ~(log_likelihood == -__builtin_inf());
+  return lost;
 }
 
 inline void probabilities(const V* law, bool logs, int modes, V* probs) {

@@ -132,6 +132,7 @@ int imm_filter(const std::string& isa, const Array& z, const nb::dict& model, co
   p.log_likelihood = output(out["log_likelihood"], std::size_t(tracks) * steps, "log_likelihood");
   p.mode_means = output(out["mode_means"], rows * M * r, "mode_means");
   p.mode_covs = output(out["mode_covs"], rows * M * r * r, "mode_covs");
+  p.faults = faults(out["faults"], tracks);
   const Kernel& kernel = kernel_of(isa);
   nb::gil_scoped_release release;
   return run_threads(kernel, p, threads);
@@ -173,7 +174,7 @@ class Bank {
     kernel_.bank_step(tracks_, rows, chains.data(), f.model, u.model, q.model, space(1));
   }
 
-  int measure(const Index& index, bool write, const Array& z, nb::handle H, nb::handle d, nb::handle R, const Out& d2,
+  nb::tuple measure(const Index& index, bool write, const Array& z, nb::handle H, nb::handle d, nb::handle R, const Out& d2,
               const Out& log_likelihood) {
     const std::vector<std::int64_t> held_rows = checked(index);
     const saltus::Rows rows{held_rows.data(), Size(held_rows.size())};
@@ -187,8 +188,8 @@ class Bank {
     read(h, "H", H, as, {m, n});
     read(o, "d", d, as, {m});
     read(r, "R", R, as, {m, m});
-    return kernel_.bank_measure(tracks_, rows, write, int(m), z.data(), h.model, o.model, r.model, d2.data(),
-                                log_likelihood.data(), space(int(m)));
+    return told(kernel_.bank_measure(tracks_, rows, write, int(m), z.data(), h.model, o.model, r.model, d2.data(),
+                                     log_likelihood.data(), space(int(m))));
   }
 
   void moments(const Index& index, nb::handle mean, nb::handle cov, nb::handle probs) {
@@ -218,7 +219,7 @@ class Bank {
   }
 
   // Law of the next mode of every row, and log f(z); `same` names for each mode the first with the same dynamics.
-  int expand(const Index& index, const Index& now, const Index& same, const Array& trans, const Array& z, nb::handle F,
+  nb::tuple expand(const Index& index, const Index& now, const Index& same, const Array& trans, const Array& z, nb::handle F,
              nb::handle b, nb::handle Q, nb::handle H, nb::handle d, nb::handle R, const Out& law,
              const Out& log_likelihood) {
     const std::vector<std::int64_t> held_rows = checked(index), modes_now = numbers(now), first = numbers(same);
@@ -245,8 +246,8 @@ class Bank {
     read(r, "R", R, as, {m, m});
     const saltus::Branches to{int(M), trans.data(), modes_now.data(), first.data()};
     double* workspace = room(kernel_.expand_workspace(tracks_, int(M), int(m)));
-    return kernel_.bank_expand(tracks_, rows, to, int(m), z.data(), f.model, u.model, q.model, h.model, o.model,
-                               r.model, law.data(), log_likelihood.data(), workspace);
+    return told(kernel_.bank_expand(tracks_, rows, to, int(m), z.data(), f.model, u.model, q.model, h.model, o.model,
+                                    r.model, law.data(), log_likelihood.data(), workspace));
   }
 
   void merge(const Index& index, const Array& weight, const Index& label, const Out& mass, const Out& means,
@@ -283,6 +284,8 @@ class Bank {
   }
 
  private:
+  static nb::tuple told(const saltus::Fault& fault) { return nb::make_tuple(fault.kind, fault.row, fault.component); }
+
   std::vector<std::int64_t> checked(const Index& index) const {
     std::vector<std::int64_t> rows = numbers(index);
     for (std::int64_t row : rows)

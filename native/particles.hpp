@@ -19,7 +19,7 @@ inline std::size_t expand_space(const Tracks& t, int modes, int m, Arena arena, 
 
 // P(next mode | path, z) and log f(z | path) of every row, each a Gaussian whose present mode is mode[row]:
 // every next mode is propagated and measured, the row itself stays as it is. Modes of one same[] share their dynamics.
-inline int expand_rows(const Tracks& t, Rows rows, const Branches& to, int m, const double* z, const Model& F,
+inline Fault expand_rows(const Tracks& t, Rows rows, const Branches& to, int m, const double* z, const Model& F,
                        const Model& b, const Model& Q, const Model& H, const Model& d, const Model& R, double* law_out,
                        double* log_likelihood, Arena arena) {
   V *copy, *states, *law, *report, *value, *on, *heap;
@@ -28,7 +28,7 @@ inline int expand_rows(const Tracks& t, Rows rows, const Branches& to, int m, co
   int* index = arena.take_ints(M);
   for (int j = 0; j < M; ++j) index[j] = j;
   const Stages steps = stages(t.n, m);
-  int status = kFine;
+  Fault fault{};
   for (Size first = 0; first < rows.count; first += W) {
     const Group group(t, rows, first, copy);
     const double* from[W];
@@ -51,15 +51,17 @@ inline int expand_rows(const Tracks& t, Rows rows, const Branches& to, int m, co
     }
     const I bad = steps.shared.score(states, t.n, m, M, {H.data, H.which, H.core}, {d.data, d.which, d.core},
                                      {R.data, R.which, R.core}, value, on, report, heap);
-    if (any(bad)) status |= kNotPositive;
+    if (any(bad)) note(fault, bad, report, M, m, first, group.lanes);
     bool logs = false;
     const V likelihood = reweigh(law, logs, M, m, report, seen, heap);
+    const I lost = lost_lanes(likelihood, false);
+    if (any(lost)) note(fault, lost, report, M, m, first, group.lanes);
     if (logs)
       for (int j = 0; j < M; ++j) law[j] = exponential(law[j]);
     store_lanes(law, index, M, law_out + first * M, M, group.lanes);
     for (int l = 0; l < group.lanes; ++l) log_likelihood[first + l] = likelihood[l];
   }
-  return status;
+  return fault;
 }
 
 // Sums over the rows of each label of width numbers per row, taken by `value(state, i)` from a row's lane-strided state.

@@ -34,7 +34,7 @@ class Recursion {
         if (k >= p.start) mix(k - p.start);
         update(k);
         weigh(k);
-        if (p.every || k == p.n_steps - 1) collapse(output.slot(k));
+        if (p.every || k == p.n_steps - 1) collapse(output.slot(k), k);
         output.store(state, n, first, tracks, k);
       }
     }
@@ -180,7 +180,7 @@ class Recursion {
       if (p.known) full.shared.propagate(state, n, p.modes, shared(p.map, 0), {}, {nothing, none, 0}, heap);
     }
     if (p.known) settle();
-    if (any(bad)) status |= kNotPositive;
+    if (any(bad)) note(bad, k);
   }
 
   void weigh(Size k) {
@@ -191,7 +191,21 @@ class Recursion {
       probabilities(law, logs, p.modes, probs);
       output.nis(out) = full.nis(report, probs, m, p.modes, heap);
     }
-    output.log_likelihood(out) = reweigh(law, logs, p.modes, m, report, seen, heap);
+    const V evidence = reweigh(law, logs, p.modes, m, report, seen, heap);
+    output.log_likelihood(out) = evidence;
+    const I lost = ~finite(evidence);
+    if (any(lost)) note(lost, k);
+  }
+
+  // Say of the lanes given up why and where, each once.
+  void note(I lanes, Size k) {
+    for (int l = 0; l < tracks; ++l) {
+      Fault& fault = p.faults[first + l];
+      if (!lanes[l] || fault.kind != kFine) continue;
+      fault = fault_of(report, p.modes, m, l);
+      fault.row = k;
+      status |= int(fault.kind);
+    }
   }
 
   // What is measured are the last components of the state: take them back in, as known as the last row left them.
@@ -231,11 +245,19 @@ class Recursion {
       }
   }
 
-  void collapse(V* out) {
+  void collapse(V* out, Size k) {
     probabilities(law, logs, p.modes, output.probs(out));
     V* target = n == p.reported ? out : moments;
     steps().collapse(state, output.probs(out), n, p.modes, target, heap);
     if (target == moments) leading(moments, n, out, p.reported);
+    V rest{};
+    for (int i = 0; i < p.reported; ++i) rest += 0.0 * out[i] + 0.0 * out[p.reported + packed(i, i)];
+    if (any(rest != 0.0)) overflowed(rest != 0.0, k);
+  }
+
+  void overflowed(I lanes, Size k) {
+    for (int l = 0; l < tracks; ++l)
+      if (lanes[l] && p.faults[first + l].kind == kFine) p.faults[first + l] = {kNotFinite, k, 0}, status |= kNotFinite;
   }
 
   const Problem& p;

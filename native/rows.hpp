@@ -84,7 +84,7 @@ inline void load_model(const Model& model, Size first, Size n_tracks, Size step,
 inline I doubtful(const Model& model, const V* loaded, int n) {
   I bad{};
   const int count = model.distinct * model.core;
-  for (int i = 0; i < count; ++i) bad |= ~(loaded[i] - loaded[i] == 0.0);
+  for (int i = 0; i < count; ++i) bad |= ~finite(loaded[i]);
   if (n == 0) return bad;
   for (const V* a = loaded; a < loaded + count; a += n * n)
     for (int i = 0; i < n; ++i) {

@@ -90,7 +90,7 @@ SALTUS_INLINE void mixing_weights(V* law, int stride, int size, const E* trans, 
   if (logs) {
     top = law[0];
     for (int i = 1; i < size; ++i) top = maximum(top, law[i * stride]);
-    top = select(top > -1e300, top, V{});
+    top = select(top > -__builtin_inf(), top, V{});
   }
   V* p = mu + size * size;
   for (int i = 0; i < size; ++i) p[i] = logs ? exponential(law[i * stride] - top) : law[i * stride];
@@ -114,7 +114,7 @@ SALTUS_INLINE void pair_weights(V& a, V& b, const E* trans, V (&mu)[4]) {
   V top{}, p = a, q = b;
   if constexpr (Logs) {
     top = maximum(a, b);
-    top = select(top > -1e300, top, V{});
+    top = select(top > -__builtin_inf(), top, V{});
     p = exponential(p - top), q = exponential(q - top);
   }
   const V p0 = p * trans[0], p1 = p * trans[1], q0 = q * trans[2], q1 = q * trans[3];

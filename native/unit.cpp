@@ -33,7 +33,7 @@ void bank_step(const Tracks& t, Rows rows, const Model* trans, const Model& F, c
   step_rows(t, rows, trans, F, b, Q, arena(workspace));
 }
 
-int bank_measure(const Tracks& t, Rows rows, bool write, int m, const double* z, const Model& H, const Model& d,
+Fault bank_measure(const Tracks& t, Rows rows, bool write, int m, const double* z, const Model& H, const Model& d,
                  const Model& R, double* d2, double* log_likelihood, double* workspace) {
   return measure_rows(t, rows, write, m, z, H, d, R, d2, log_likelihood, arena(workspace));
 }
@@ -55,7 +55,7 @@ std::size_t expand_workspace(const Tracks& t, int modes, int m) {
   return (expand_space(t, modes, m, {}, &copy, &states, &law, &report, &value, &on, &heap) + modes + 1) * W;
 }
 
-int bank_expand(const Tracks& t, Rows rows, const Branches& to, int m, const double* z, const Model& F, const Model& b,
+Fault bank_expand(const Tracks& t, Rows rows, const Branches& to, int m, const double* z, const Model& F, const Model& b,
                 const Model& Q, const Model& H, const Model& d, const Model& R, double* law, double* log_likelihood,
                 double* workspace) {
   return expand_rows(t, rows, to, m, z, F, b, Q, H, d, R, law, log_likelihood, arena(workspace));

@@ -44,3 +44,25 @@ def test_gaussian_terms(rng):
     assert error(L_inv.swapaxes(-1, -2) @ L_inv, np.linalg.inv(S)) < 1e-12
     with pytest.raises(np.linalg.LinAlgError):
         linalg.gaussian_terms(np.zeros(2), np.array([[1.0, 2.0], [2.0, 1.0]]))
+
+
+@pytest.mark.parametrize("size", [1.0, 1e8, 1e16, 1e300])
+def test_weights_of_any_size_are_normalised_to_the_last_bits(rng, size):
+    log_w = rng.normal(size=(4, 3)) - size
+    got, total = linalg.normalised(log_w, (1,))
+    np.testing.assert_allclose(np.exp(got).sum(1), 1.0, rtol=1e-15)
+    np.testing.assert_allclose(total, special.logsumexp(log_w, axis=1, keepdims=True), rtol=1e-15)
+    nothing, total = linalg.normalised(np.full((1, 2), -np.inf), (1,))
+    assert nothing.tolist() == [[-np.inf, -np.inf]] and total == -np.inf
+
+
+def test_a_root_of_what_rounding_has_made_indefinite(rng):
+    root = rng.normal(size=(50, 4, 2)) * 10.0 ** rng.uniform(-9, 9, size=(50, 4, 1))
+    P = linalg.symmetric(root @ root.swapaxes(-1, -2))  # rank 2, but for rounding
+    L = linalg.cholesky(P)
+    sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+    assert not np.triu(L, 1).any()
+    assert (
+        np.abs((L @ L.swapaxes(-1, -2) - P) / (sigma[:, :, None] * sigma[:, None])).max() < 1e-11
+    )  # rounding over the second pivot
+    assert np.isnan(linalg.cholesky(np.array([[1.0, 2.0], [2.0, np.nan]]))).any()  # and no number out of none

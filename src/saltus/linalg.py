@@ -4,7 +4,9 @@ import numpy as np
 
 from saltus.shapes import Float
 
-__all__ = ["block_diagonal", "gaussian_terms", "logsumexp", "quadratic_form", "symmetric"]
+__all__ = ["block_diagonal", "cholesky", "gaussian_terms", "logsumexp", "normalised", "quadratic_form", "symmetric"]
+
+_ROUNDING = 2.0 * float(np.finfo(np.float64).eps)  # share of a variance below which what is left of it is rounding
 
 
 def symmetric(a: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
@@ -30,6 +32,47 @@ def logsumexp(a: Float[np.ndarray, "*shape"], axes: tuple[int, ...]) -> Float[np
         return np.asarray(np.log(np.sum(np.exp(a - shift), axis=axes, keepdims=True)) + shift)
 
 
+def normalised(
+    log_w: Float[np.ndarray, "*shape"], axes: tuple[int, ...]
+) -> tuple[Float[np.ndarray, "*shape"], Float[np.ndarray, "*reduced"]]:
+    """Return log w - log sum w, and log sum w with `axes` kept as axes of length 1.
+
+    The greatest is subtracted first: weights sum to 1 to rounding whatever their size, where subtracting the logarithm
+    of the sum would leave its rounding, 2 nats at 1e16. Where no weight is possible (the sum is 0) none becomes so.
+    """
+    top = np.max(log_w, axis=axes, keepdims=True, initial=-np.inf)
+    shift = np.where(np.isfinite(top), top, 0.0)
+    near = log_w - shift
+    with np.errstate(divide="ignore"):
+        log_sum = np.log(np.sum(np.exp(near), axis=axes, keepdims=True))
+    return np.asarray(near - np.where(log_sum > -np.inf, log_sum, 0.0)), np.asarray(log_sum + shift)
+
+
+def cholesky(P: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
+    """Return lower triangular L with L L' = P, for singular P too: where nothing is left, its column is zero.
+
+    What rounding has left of a variance, or has taken from it below zero, is nothing: L L' is positive semidefinite
+    whatever P is.
+    """
+    try:
+        return np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        return _semidefinite(np.asarray(P))
+
+
+def _semidefinite(P: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
+    """Cholesky's columns one by one; a pivot at rounding ends its column. NaN stays NaN."""
+    n = P.shape[-1]
+    L = np.zeros_like(P)
+    for j in range(n):
+        rest = P[..., :, j] - (L[..., :, :j] @ L[..., j, :j, None])[..., 0]
+        pivot = rest[..., j]
+        nothing = pivot <= n * _ROUNDING * P[..., j, j]
+        column = rest / np.sqrt(np.where(nothing, 1.0, pivot))[..., None]
+        L[..., j:, j] = np.where(nothing[..., None], 0.0, column[..., j:])
+    return L
+
+
 def gaussian_terms(
     nu: Float[np.ndarray, "*lead m"], S: Float[np.ndarray, "*lead m m"]
 ) -> tuple[Float[np.ndarray, "*lead"], Float[np.ndarray, "*lead"], Float[np.ndarray, "*lead m m"]]:
@@ -42,7 +85,9 @@ def gaussian_terms(
     L_inv = np.linalg.inv(L)
     white = (L_inv @ nu[..., None])[..., 0]
     logdet = 2.0 * np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(-1)
-    return np.asarray(np.sum(white * white, axis=-1)), np.asarray(logdet), L_inv  # arrays without leading axes too
+    with np.errstate(over="ignore"):  # a distance may be infinite
+        d2 = np.asarray(np.sum(white * white, axis=-1))
+    return d2, np.asarray(logdet), L_inv  # arrays without leading axes too
 
 
 def block_diagonal(*blocks: Float[np.ndarray, "..."]) -> Float[np.ndarray, "*lead p p"]:

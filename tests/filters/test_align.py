@@ -93,10 +93,10 @@ def test_rows_to_keep_are_checked():
         bare(**GOOD, keep="first")
 
 
-def test_indefinite_matrices_beyond_the_eigenvalue_checks_are_seen_by_their_diagonal():
+def test_an_indefinite_matrix_among_many_is_found():
     many = np.broadcast_to(np.eye(2), (5000, 1, 1, 2, 2)).copy()
-    many[4321, 0, 0, 1, 1] = -1.0
-    with pytest.raises(ModelError, match="Q is not positive semidefinite"):
+    many[4321, 0, 0] = INDEFINITE
+    with pytest.raises(ModelError, match=r"Q is not positive semidefinite at index \[4321, 0, 0\]"):
         align(**{**GOOD, "z": np.zeros((5000, 1)), "Q": many})
 
 
@@ -146,3 +146,20 @@ def test_rounding_in_transition_rows_does_not_grow_over_empty_rows():
     trans = np.array([[0.9, 0.1], [0.2, 0.8]]) * (1 + 9e-7)
     est = imm_filter(**{**GOOD, "z": np.full((100, 1), np.nan), "trans": [trans, np.eye(3)]})
     assert np.abs(est.probs.sum((-1, -2)) - 1.0).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("F", [np.eye(2), np.eye(3)]),
+        ("H", [[1.0, 0.0], [1.0, 0.0, 0.0]]),
+        ("mean0", [[0.0, 1.0], [0.0]]),
+        ("z", [[0.0], [0.0, 1.0]]),
+        ("R", [[[1.0]], [[1.0, 0.0], [0.0, 1.0]]]),
+    ],
+)
+def test_modes_of_different_size_are_told_how_to_agree(name, value):
+    with pytest.raises(ModelError, match=rf"{name} is not one array.*All modes have one state vector.*zeros in H"):
+        inspect.unwrap(align)(**{**GOOD, name: value})
+    with pytest.raises(ModelError, match=f"{name} is not an array of numbers"):
+        inspect.unwrap(align)(**{**GOOD, name: "x"})

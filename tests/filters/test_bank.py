@@ -6,11 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from oracles import error
-from saltus.errors import ModelError, NumericalError
+from saltus.compiled import native_module
+from saltus.errors import DataError, ModelError, NumericalError
 from saltus.filters import Bank, Belief, imm_filter
 from strategies import law, quick, random_cov, random_problem, rngs
 
 ROUND_OFF = 1e-11
+BACKENDS = ["numpy"] if native_module() is None else ["numpy", "native"]
 
 
 def start(problem, n_rows):
@@ -233,7 +235,7 @@ def test_ragged_hypotheses_are_mixtures_mode_by_mode(rng, sizes, groups):
     log_weights[1 : groups[0]] = -np.inf
     copies, bank = Bank(n, sizes, capacity=1), Bank(n, sizes, capacity=9)
     copies = copies.take(copies.add(each))
-    rows = rng.permutation(9)[: len(groups)]
+    rows = rng.permutation(bank.add(belief_of(0.0, 9, sizes, n)))[: len(groups)]
     log_f, log_posterior = bank.merge(rows, copies, start, log_weights)
     got = bank.read(rows)
     for g, row in enumerate(zip(*got, strict=True)):
@@ -277,3 +279,107 @@ def test_one_hypothesis_is_the_copy_itself(rng):
     assert (log_f, posterior) == (-750.0, 0.0)
     for now, then in zip(bank.read(rows), expected, strict=True):
         np.testing.assert_allclose(now, then, rtol=1e-14)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_rows_that_are_not_in_use_are_refused_everywhere(backend):
+    bank = Bank(2, (2,), capacity=8, backend=backend)
+    rows = bank.add(belief_of(1.0, 3))
+    bank.remove(rows[1:2])
+    one, z = np.eye(2)[None, None], np.zeros((1, 1))
+    H, R = np.ones((1, 1, 1, 2)), np.ones((1, 1, 1, 1))
+    uses = {
+        "remove": bank.remove,
+        "read": bank.read,
+        "write": lambda r: bank.write(r, belief_of(0.0)),
+        "take": bank.take,
+        "put": lambda r: bank.put(r, bank, rows[:1]),
+        "moments": bank.moments,
+        "step": lambda r: bank.step(r, [None], one, None, one),
+        "score": lambda r: bank.score(r, z, H, None, R),
+        "update": lambda r: bank.update(r, z, H, None, R),
+    }
+    for use in uses.values():
+        for row in (rows[1], 7, 8, -1, 10**12):  # removed, never added, beyond the end, before the start
+            with pytest.raises(ModelError, match=f"row {row} is not in this bank: it was never added, or has been rem"):
+                use(np.array([row]))
+    assert len(bank) == 2 and values(bank, rows[[0, 2]]) == [1.0, 3.0]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_row_named_twice_is_refused_where_rows_change(backend):
+    bank = Bank(2, (2,), backend=backend)
+    rows = bank.add(belief_of(1.0, 3))
+    twice, one = rows[[0, 2, 0]], np.eye(2)[None, None]
+    H, R = np.ones((1, 1, 1, 2)), np.ones((1, 1, 1, 1))
+    for use in (
+        lambda: bank.remove(twice),
+        lambda: bank.step(twice, [None], one, None, one),
+        lambda: bank.update(twice, np.zeros((3, 1)), H, None, R),
+        lambda: bank.put(twice, bank, rows),
+        lambda: bank.write(twice, belief_of(0.0, 3)),
+    ):
+        with pytest.raises(ModelError, match=f"row {rows[0]} is named twice"):
+            use()
+    bank.remove(rows)
+    two = bank.add(belief_of(5.0, 2))
+    assert len(set(two.tolist())) == 2 == len(bank)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_what_is_measured_is_checked(backend):
+    bank = Bank(2, (2,), backend=backend)
+    rows = bank.add(belief_of(1.0, 2))
+    before = bank.read(rows)
+    H, R = np.ones((1, 1, 1, 2)), np.ones((1, 1, 1, 1))
+    for what in (bank.update, bank.score):
+        for bad in (np.inf, -np.inf):
+            with pytest.raises(DataError, match=r"z\[1, 0\] is infinite\. A missing component is NaN"):
+                what(rows, np.array([[0.0], [bad]]), H, None, R)
+        with pytest.raises(ModelError, match=r"z has shape \(1, 1\); it is \(k, m\)"):
+            what(rows, np.zeros((1, 1)), H, None, R)
+    for a, b in zip(before, bank.read(rows), strict=True):
+        np.testing.assert_array_equal(a, b)
+    far = np.array([[0.0], [1e200]])
+    assert bank.score(rows, far, H, None, R)[1][1] == -np.inf  # how far away it is may be asked
+    with pytest.raises(DataError, match=r"component 0 measures 1e\+200"):
+        bank.update(rows, far, H, None, R)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("part", "value", "kind", "message"),
+    [
+        ("log_probs", [[0.0]], ModelError, r"log_probs of a belief has shape \(1, 1\); in this bank it is \(1, 2\)"),
+        ("means", [[[0.0, np.nan], [0.0, 0.0]]], DataError, r"means\[0, 0, 1\] of a belief is nan"),
+        ("covs", np.ones((1, 2, 3, 3)), ModelError, r"covs of a belief has shape"),
+        ("log_probs", [[0.0, np.nan]], DataError, r"log_probs\[0, 1\] of a belief is nan"),
+        ("log_probs", [[0.5, 0.5]], DataError, r"log_probs\[0, 0\] of a belief is 0.5"),
+    ],
+)
+def test_a_belief_that_is_none_is_refused(backend, part, value, kind, message):
+    bank = Bank(2, (2,), backend=backend)
+    with pytest.raises(kind, match=message):
+        bank.add(belief_of(0.0)._replace(**{part: np.asarray(value)}))
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"F": np.eye(3)[None, None]}, "F has shape"),
+        ({"Q": np.ones((2, 1, 2, 2))}, "Q has shape"),
+        ({"trans": [np.eye(3)]}, "trans.* has shape"),
+        ({"trans": []}, "one transition matrix"),
+        ({"H": np.ones((1, 1, 2, 2))}, "H has shape"),
+        ({"R": np.ones((1, 3, 1, 1))}, "R has shape"),
+    ],
+)
+def test_arrays_that_do_not_fit_a_bank(backend, change, message):
+    bank = Bank(2, (2,), backend=backend)
+    rows = bank.add(belief_of(1.0, 3))
+    one = np.eye(2)[None, None]
+    a = {"trans": [None], "F": one, "Q": one, "H": np.ones((1, 1, 1, 2)), "R": np.ones((1, 1, 1, 1))} | change
+    with pytest.raises(ModelError, match=message):
+        bank.step(rows, a["trans"], a["F"], None, a["Q"])
+        bank.update(rows, np.zeros((3, 1)), a["H"], None, a["R"])

@@ -144,7 +144,7 @@ def test_rows_that_do_not_exist_and_arrays_that_do_not_fit(rng):
     bank = Bank(2, (2,), capacity=8, backend="native")
     rows = bank.add(beliefs(rng, 3, (2,), 2))
     for wrong in (np.array([8]), np.array([-1]), np.array([10**12])):
-        with pytest.raises(IndexError, match="not in this bank"):
+        with pytest.raises(ModelError, match="not in this bank"):
             bank.read(wrong)
     trans, F, _, Q = [random_trans(rng, 2)], np.eye(2)[None, None], None, np.eye(2)[None, None]
     H, R = np.ones((1, 1, 1, 2)), np.ones((1, 1, 1, 1))

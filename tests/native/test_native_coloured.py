@@ -272,7 +272,7 @@ def test_the_binding_itself_checks_the_map():
     model |= {"n": 2, "sizes": [], "b": None, "d": None, "mean0": np.ones((1, 2)), "cov0": np.eye(2)[None]}
     model |= {"log_probs0": np.zeros(1), "trans": [], "reported": 1, "from_first": True, "map": np.eye(2)}
     out = {name: np.empty(2) for name in ("probs", "mean", "cov", "nis", "n_observed", "log_likelihood")}
-    out |= {"mode_means": None, "mode_covs": None}
+    out |= {"mode_means": None, "mode_covs": None, "faults": np.zeros((1, 3), np.int64)}
     z = np.zeros((1, 2, 1))
     assert _native.imm_filter("", z, model, out, True, 1) == 0
     for wrong, message in (

@@ -12,11 +12,11 @@ import numpy.typing as npt
 
 from saltus.errors import DataError, ModelError
 
-__all__ = ["Aligned", "align"]
+__all__ = ["Aligned", "align", "array", "covariances", "finite"]
 
 _Array = npt.NDArray[np.float64]
 _LARGE = 100_000  # elements above which reading an array once more is worth avoiding
-_MAX_EIGEN_CHECKS = 4096  # matrices whose eigenvalues are looked at; beyond, the update's Cholesky tells
+_INDEFINITE = 1e-8  # of a variance: a pivot below minus this is no rounding
 
 
 class Aligned(NamedTuple):
@@ -49,7 +49,8 @@ class _Reader:
 
     def model(self, name: str, value: npt.ArrayLike, core: tuple[int, ...]) -> _Array:
         """Read a model array with trailing axes `core`: constant, time varying or per run."""
-        a = np.asarray(value, dtype=np.float64) if self._deferred(value, core) else _finite(name, value)
+        a = array(name, value)
+        a = a if self._deferred(a, core) else finite(name, a)
         n_modes, base = len(self.sizes), len(self.sizes) + len(core)
         expected = f"(*{self.batch}, {self.n_steps}|1, {_modes(self.sizes)}{_axes(core)})"
         if a.ndim < base:
@@ -63,16 +64,17 @@ class _Reader:
 
     def covariance(self, name: str, value: npt.ArrayLike, core: tuple[int, ...]) -> _Array:
         """Read a model array of covariances."""
+        value = array(name, value)
         a = self.model(name, value, core)
-        return a if self._deferred(value, core) else _covariance(name, a)
+        return a if self._deferred(value, core) else covariances(name, a)
 
-    def _deferred(self, value: npt.ArrayLike, core: tuple[int, ...]) -> bool:
+    def _deferred(self, value: _Array, core: tuple[int, ...]) -> bool:
         """Whether the elements are left to the compiled kernel: given per run, and too large to be read twice."""
-        return self.defer and np.ndim(value) > len(self.sizes) + 1 + len(core) and np.size(value) > _LARGE
+        return self.defer and value.ndim > len(self.sizes) + 1 + len(core) and value.size > _LARGE
 
     def prior(self, name: str, value: npt.ArrayLike, core: tuple[int, ...]) -> _Array:
         """Read mean0 or cov0: shared, per mode, or per run."""
-        a = _finite(name, value)
+        a = finite(name, value)
         n_modes = len(self.sizes)
         expected = f"{core} shared, ({_modes(self.sizes)}{_axes(core)}) per mode, (*{self.batch}, ...) per run"
         if a.ndim == len(core):
@@ -86,7 +88,7 @@ class _Reader:
 
     def plain(self, name: str, value: npt.ArrayLike, core: tuple[int, ...], timed: bool) -> _Array:
         """Read probs0 (core = sizes) or a transition matrix (core = (Mc, Mc), `timed`): no broadcast in core."""
-        a = _finite(name, value)
+        a = finite(name, value)
         lead = (*self.batch, self.n_steps) if timed else self.batch
         expected = f"{core}" + (f", ({self.n_steps}, {_axes(core)}) time varying" if timed else "") + " or per run"
         if a.ndim < len(core):
@@ -133,10 +135,11 @@ def align(
     """
     z_in, seen = _measurements(z, defer)
     m = z_in.shape[-1]
-    if np.ndim(cov0) < 2:
-        raise ModelError(f"cov0 has shape {np.shape(cov0)}; it is a covariance matrix, (n, n), per mode or per run.")
-    n = int(np.shape(cov0)[-1])
-    matrices = [np.asarray(t, dtype=np.float64) for t in trans]
+    cov0 = array("cov0", cov0)
+    if cov0.ndim < 2:
+        raise ModelError(f"cov0 has shape {cov0.shape}; it is a covariance matrix, (n, n), per mode or per run.")
+    n = cov0.shape[-1]
+    matrices = [array(f"trans[{c}]", t) for c, t in enumerate(trans)]
     for c, t in enumerate(matrices):
         if t.ndim < 2 or t.shape[-1] != t.shape[-2] or t.shape[-1] == 0:
             raise ModelError(f"trans[{c}] has shape {t.shape}; a transition matrix is square, (M, M).")
@@ -153,12 +156,12 @@ def align(
         trans=tuple(_transition(c, reader.plain(f"trans[{c}]", t, t.shape[-2:], True)) for c, t in enumerate(matrices)),
         log_probs0=_log_law("probs0", reader.plain("probs0", probs0, reader.sizes, False), len(matrices)),
         mean0=reader.prior("mean0", mean0, (n,)),
-        cov0=_covariance("cov0", reader.prior("cov0", cov0, (n, n))),
+        cov0=covariances("cov0", reader.prior("cov0", cov0, (n, n))),
     )
 
 
 def _measurements(z: npt.ArrayLike, defer: bool) -> tuple[_Array, npt.NDArray[np.bool_]]:
-    z_in = np.asarray(z, dtype=np.float64)
+    z_in = array("z", z)
     if z_in.ndim < 2 or z_in.shape[-2] == 0 or z_in.shape[-1] == 0:
         raise DataError(f"z has shape {z_in.shape}; it is (*batch, T, m) with T and m at least 1.")
     if defer:
@@ -170,28 +173,85 @@ def _measurements(z: npt.ArrayLike, defer: bool) -> tuple[_Array, npt.NDArray[np
     return np.where(seen, z_in, 0.0), seen
 
 
-def _finite(name: str, value: npt.ArrayLike) -> _Array:
-    a = np.asarray(value, dtype=np.float64)
+def array(name: str, value: npt.ArrayLike) -> _Array:
+    """Read an array of numbers.
+
+    Raises:
+        ModelError: it is ragged, or not of numbers.
+    """
+    try:
+        return np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        shapes = dict.fromkeys(str(np.shape(v)) for v in _elements(value))
+        if len(shapes) < 2:
+            raise ModelError(f"{name} is not an array of numbers: {error}.") from None
+        raise ModelError(
+            f"{name} is not one array: its elements have the shapes {', '.join(shapes)}. All modes have one state "
+            "vector and one measurement. Embed the smaller model in the larger: rows and columns of zeros in F and Q, "
+            "columns of zeros in H, and a variance in cov0 for the states it does not have."
+        ) from None
+
+
+def _elements(value: object) -> Sequence[npt.ArrayLike]:
+    """The elements of a list of lists, as deep as they can be told apart."""
+    if not isinstance(value, list | tuple):
+        return ()
+    try:
+        shapes = {np.shape(v) for v in value}
+    except ValueError:  # ragged themselves
+        return [inner for v in value for inner in _elements(v)]
+    return value if len(shapes) > 1 else ()
+
+
+def finite(name: str, value: npt.ArrayLike) -> _Array:
+    """Read an array of finite numbers.
+
+    Raises:
+        ModelError: it is ragged, or not of numbers.
+        DataError: NaN or inf.
+    """
+    a = array(name, value)
     if not np.isfinite(a).all():
         where = [int(i) for i in np.argwhere(~np.isfinite(a))[0]]
         raise DataError(f"{name}{where} is {a[tuple(where)]}; only z may hold NaN (a missing component).")
     return a
 
 
-def _covariance(name: str, a: _Array) -> _Array:
+def covariances(name: str, a: _Array) -> _Array:
+    """Check that matrices are covariances, and make them symmetric to the last bit.
+
+    Eigenvalues are judged in units of each matrix's own variances: a small one beside a large one counts in full.
+
+    Raises:
+        ModelError: one is not symmetric or not positive semidefinite; the message has its index.
+    """
     swapped = a.swapaxes(-1, -2)
-    scale = np.abs(a).max(axis=(-1, -2), keepdims=True, initial=0.0)
+    sigma = np.sqrt(np.maximum(np.diagonal(a, axis1=-2, axis2=-1), 0.0))
+    scale = sigma[..., :, None] * sigma[..., None, :]
     if (np.abs(a - swapped) > 1e-8 * scale).any():
         where = [int(i) for i in np.argwhere(np.abs(a - swapped) > 1e-8 * scale)[0]]
         raise ModelError(f"{name} is not symmetric at index {where}. A covariance equals its transpose.")
     a = 0.5 * (a + swapped)
-    diagonal = np.diagonal(a, axis1=-2, axis2=-1)
-    negative = (diagonal < 0).any()
-    if not negative and a.size // max(1, a.shape[-1] ** 2) <= _MAX_EIGEN_CHECKS:
-        negative = (np.linalg.eigvalsh(a) < -1e-9 * scale[..., 0]).any()
-    if negative:
-        raise ModelError(f"{name} is not positive semidefinite. Give covariances, never factors or precisions.")
+    bad = _indefinite(a, scale)
+    if bad.any():
+        where = [int(i) for i in np.argwhere(bad)[0]]
+        at = f" at index {where}" if where else ""
+        raise ModelError(f"{name} is not positive semidefinite{at}. Give covariances, never factors or precisions.")
     return a
+
+
+def _indefinite(a: _Array, scale: _Array) -> npt.NDArray[np.bool_]:
+    """Which matrices are no covariances, by their pivots in units of the variances."""
+    unit = np.divide(a, scale, out=np.zeros_like(a), where=scale > 0)
+    bad = np.asarray(((a != 0) & (scale == 0)).any(axis=(-1, -2)))
+    for j in range(a.shape[-1]):
+        pivot, rest = unit[..., j, j], unit[..., j + 1 :, j]
+        bad |= pivot < -_INDEFINITE
+        dead = pivot <= _INDEFINITE
+        bad |= dead & (np.abs(rest) > np.sqrt(_INDEFINITE)).any(axis=-1)
+        share = np.where(dead[..., None], 0.0, rest) / np.where(dead, 1.0, pivot)[..., None]
+        unit = unit - np.pad(share[..., :, None] * rest[..., None, :], [(0, 0)] * (a.ndim - 2) + [(j + 1, 0)] * 2)
+    return bad
 
 
 def _transition(c: int, t: _Array) -> _Array | None:

@@ -2,24 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from math import prod
-from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 
-from saltus.errors import ModelError, NumericalError
-from saltus.filters import steps
+from saltus.errors import DataError, ModelError, NumericalError
 from saltus.filters.backend import MOST_MODES, MOST_STATES, Backend, use_native
-from saltus.filters.memoryless import merge_copies
-from saltus.filters.particles import Merged, Tables, expanded, merged
+from saltus.filters.particles import Merged, Tables
 from saltus.filters.steps import Belief
+from saltus.filters.store import NumpyStore, Store
 from saltus.shapes import Float, Int
 
-__all__ = ["Bank", "NumpyStore"]
+__all__ = ["Bank"]
 
 _Rows = npt.NDArray[np.intp]
 _Modes = npt.NDArray[np.int64]
 _Array = npt.NDArray[np.float64]
+_MOST_LOG = 1e-6  # of a law that sums to 1, for rounding
 
 
 class Bank:
@@ -32,7 +31,8 @@ class Bank:
     With `mode`, row i looks its matrices up: arrays are tables `(M|1, rows, cols)` and row i takes `table[mode[i]]`.
     That is for particles, rows of a bank without chains whose joint mode is known (`expand`, `merged`).
 
-    A row number is valid from `add` until `remove`; freed rows are used again.
+    A row number is valid from `add` until `remove`; freed rows are used again. Every method refuses, with a ModelError,
+    rows that are not in use, and those that change rows refuse one named twice.
     """
 
     def __init__(self, n: int, sizes: tuple[int, ...], capacity: int = 64, backend: Backend | None = None) -> None:
@@ -50,31 +50,41 @@ class Bank:
         self._store = _make_store(n, self.sizes, capacity, backend)
         self._capacity = capacity
         self._free: list[int] = list(range(capacity - 1, -1, -1))
+        self._used, self._mark = np.zeros(capacity, bool), np.zeros(capacity, np.intp)
 
     def __len__(self) -> int:
         """Number of rows in use."""
         return self._capacity - len(self._free)
 
     def add(self, belief: Belief) -> Int[np.ndarray, " k"]:
-        """Store beliefs with one leading axis (k, M1, ..., MC[, n[, n]]) and return their row numbers."""
+        """Store beliefs with one leading axis (k, M1, ..., MC[, n[, n]]) and return their row numbers.
+
+        Raises:
+            ModelError: another shape.
+            DataError: a mean or covariance that is not finite, or a log-probability that is none.
+        """
         count = len(belief.log_probs)
+        belief = self._belief(belief, count)
         while len(self._free) < count:
             self._grow()
         rows = np.array([self._free.pop() for _ in range(count)], dtype=np.intp)
-        self.write(rows, belief)
+        self._used[rows] = True
+        self._store.write(rows, belief)
         return rows
 
     def remove(self, rows: _Rows) -> None:
         """Free rows."""
-        self._free.extend(int(r) for r in rows)
+        rows = self._distinct(rows)
+        self._used[rows] = False
+        self._free.extend(rows.tolist())
 
     def read(self, rows: _Rows) -> Belief:
         """Return copies of the rows' beliefs."""
-        return self._store.read(rows)
+        return self._store.read(self._in_use(rows))
 
     def write(self, rows: _Rows, belief: Belief) -> None:
-        """Overwrite rows."""
-        self._store.write(rows, belief)
+        """Overwrite rows; errors as `add`."""
+        self._store.write(self._distinct(rows), self._belief(belief, len(rows)))
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return what `restore` goes on from: the beliefs of all rows, and the free ones in the order of their use."""
@@ -88,14 +98,21 @@ class Bank:
 
     def take(self, rows: _Rows) -> "Bank":
         """Return a new bank whose rows 0..k-1 are copies of `rows` (repeats allowed: hypotheses, resampling)."""
+        rows = self._in_use(rows)
         bank = Bank.__new__(Bank)  # nothing to check again, and no room to make twice
         bank.n, bank.sizes, bank.backend = self.n, self.sizes, self.backend
         bank._store, bank._capacity, bank._free = self._store.take(rows), len(rows), []
+        bank._used, bank._mark = np.ones(len(rows), bool), np.zeros(len(rows), np.intp)
         return bank
 
     def put(self, rows: _Rows, other: "Bank", other_rows: _Rows) -> None:
         """Overwrite `rows` with copies of another bank's rows."""
-        self._store.copy_from(rows, other._store, other_rows)
+        if (self.n, self.sizes) != (other.n, other.sizes) or len(rows) != len(other_rows):
+            raise ModelError(
+                f"rows are copied between banks of one kind, as many as there are: {len(rows)} of n={self.n}, "
+                f"sizes={self.sizes} and {len(other_rows)} of n={other.n}, sizes={other.sizes} do not go together."
+            )
+        self._store.copy_from(self._distinct(rows), other._store, other._in_use(other_rows))
 
     def step(
         self,
@@ -107,20 +124,28 @@ class Bank:
         *,
         mode: _Modes | None = None,
     ) -> None:
-        """Mix and propagate rows over their intervals (no row twice)."""
-        self._store.step(rows, trans, F, b, Q, mode)
+        """Mix and propagate rows over their intervals (no row twice).
+
+        Raises:
+            ModelError: arrays that do not fit.
+        """
+        self._store.step(self._distinct(rows), trans, F, b, Q, mode)
 
     def score(
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, mode: _Modes | None = None
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
         """Return gate distance d2 and log f(z) of measurement z[i] for row rows[i] (repeats allowed).
 
-        d2 is the squared Mahalanobis distance to the mixture's predicted measurement; NaN components count not.
+        d2 is the squared Mahalanobis distance to the mixture's predicted measurement; NaN components count not. Where a
+        distance overflows log f is -inf.
 
         Raises:
-            NumericalError: an innovation covariance is not positive definite.
+            ModelError: arrays that do not fit.
+            DataError: inf in z.
+            NumericalError: a measured component has neither noise nor uncertainty, or a prediction has overflowed.
         """
-        return self._store.measure(rows, z, H, d, R, mode, write=False)
+        rows = self._in_use(rows)
+        return self._store.measure(rows, _measured(z, len(rows)), H, d, R, mode, write=False)
 
     def update(
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, *, mode: _Modes | None = None
@@ -128,9 +153,14 @@ class Bank:
         """Condition row rows[i] on z[i] (no row twice); return d2 and log f(z) as `score` does.
 
         Raises:
-            NumericalError: an innovation covariance is not positive definite; what the rows hold is then undefined.
+            ModelError: arrays that do not fit.
+            DataError: inf in z, or a z so far from its prediction that the distance overflows.
+            NumericalError: a measured component has neither noise nor uncertainty, or a prediction has overflowed.
+                After a DataError or NumericalError that names a row i, only row rows[i] is undefined in the native
+                store; the NumPy store leaves all rows as they were.
         """
-        return self._store.measure(rows, z, H, d, R, mode, write=True)
+        rows = self._distinct(rows)
+        return self._store.measure(rows, _measured(z, len(rows)), H, d, R, mode, write=True)
 
     def merge(
         self, rows: _Rows, copies: "Bank", start: _Rows, log_weights: _Array
@@ -158,6 +188,8 @@ class Bank:
 
         Source: theory notes on fusion, sections 4 and 5, with a memoryless chain on each measurement.
         """
+        rows = self._distinct(rows)
+        copies._in_use(np.arange(len(log_weights)))
         size = np.diff(start)
         if len(start) != len(rows) + 1 or start[0] != 0 or start[-1] != len(log_weights) or (size < 1).any():
             raise ModelError(
@@ -172,10 +204,11 @@ class Bank:
             raise NumericalError(
                 f"row {rows[np.argmin(np.isfinite(top))]}: no hypothesis is possible. Give one of them a finite weight."
             )
-        log_f = top + np.log(np.add.reduceat(np.exp(log_weights - top[group]), start[:-1]))
-        log_posterior = np.asarray(log_weights - log_f[group])
+        near = log_weights - top[group]  # as linalg.normalised: an outlier's weights sum to 1 too
+        log_sum = np.log(np.add.reduceat(np.exp(near), start[:-1]))
+        log_posterior = np.asarray(near - log_sum[group])
         self._store.merge(rows, copies._store, start, log_posterior)
-        return log_f, log_posterior
+        return top + log_sum, log_posterior
 
     def expand(
         self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables
@@ -191,153 +224,103 @@ class Bank:
             z: measurement of each row, (k, m); NaN is a missing component.
             tables: matrices by mode, (M|1, ...) each.
 
+        Where every next mode's distance overflows log f is -inf, and the law that of `trans`.
+
         Raises:
-            NumericalError: an innovation covariance is not positive definite.
+            DataError: inf in z.
+            NumericalError: a measured component has neither noise nor uncertainty, or a prediction has overflowed.
         """
-        return self._store.expand(rows, now, trans, z, tables)
+        rows = self._in_use(rows)
+        return self._store.expand(rows, now, trans, _measured(z, len(rows)), tables)
 
     def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:
         """Return total weight, mean and covariance of the rows of each label, particles of a bank without chains."""
-        return self._store.merged(rows, weights, labels, n_labels)
+        return self._store.merged(self._in_use(rows), weights, labels, n_labels)
 
     def moments(
         self, rows: _Rows
     ) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n n"], Float[np.ndarray, "k *_sizes"]]:
         """Return mean, covariance and mode probabilities of rows."""
-        return self._store.moments(rows)
+        return self._store.moments(self._in_use(rows))
+
+    def _in_use(self, rows: _Rows) -> _Rows:
+        """Return the rows as an index.
+
+        Raises:
+            ModelError: one was never added, or has been removed.
+        """
+        index = np.asarray(rows)
+        if not index.size:
+            return index.astype(np.intp)
+        if index.ndim != 1 or index.dtype.kind not in "iu":
+            raise ModelError(f"rows are a list of whole numbers (k,), got {index.dtype} of shape {index.shape}.")
+        index = index.astype(np.intp, copy=False)
+        if index.min() >= 0 and index.max() < self._capacity and self._used[index].all():
+            return index
+        for row in index:
+            if not 0 <= row < self._capacity or not self._used[row]:
+                break
+        raise ModelError(
+            f"row {row} is not in this bank: it was never added, or has been removed. Rows are from add()."
+        )
+
+    def _distinct(self, rows: _Rows) -> _Rows:
+        """Return the rows as an index.
+
+        Raises:
+            ModelError: one is not in use, or is named twice.
+        """
+        index = self._in_use(rows)
+        order = np.arange(len(index))
+        self._mark[index] = order
+        if (self._mark[index] != order).any():
+            twice = index[self._mark[index] != order][0]
+            raise ModelError(f"row {twice} is named twice: what should become of it? Name every row once.")
+        return index
+
+    def _belief(self, belief: Belief, count: int) -> Belief:
+        lead = (count, *self.sizes)
+        arrays = []
+        for name, a, core in zip(Belief._fields, belief, ((), (self.n,), (self.n, self.n)), strict=True):
+            a = np.asarray(a, dtype=np.float64)
+            if a.shape != (*lead, *core):
+                raise ModelError(f"{name} of a belief has shape {a.shape}; in this bank it is {(*lead, *core)}.")
+            sound = a <= _MOST_LOG if name == "log_probs" else np.isfinite(a)
+            if not sound.all():
+                where = [int(i) for i in np.argwhere(~sound)[0]]
+                raise DataError(f"{name}{where} of a belief is {a[tuple(where)]}.")
+            arrays.append(a)
+        return Belief(*arrays)
 
     def _grow(self) -> None:
         old = self._capacity
         self._capacity = max(8, 2 * old)
         self._store.grow(self._capacity)
+        self._used, self._mark = np.resize(self._used, self._capacity), np.zeros(self._capacity, np.intp)
+        self._used[old:] = False
         self._free.extend(range(self._capacity - 1, old - 1, -1))
 
 
-@runtime_checkable
-class _Store(Protocol):
-    """Where a bank keeps its rows, and what can be done to them. Two stores that meet are of one kind."""
+def _measured(z: _Array, k: int) -> _Array:
+    """Check the measurements of k rows.
 
-    def grow(self, capacity: int) -> None: ...
-    def read(self, rows: _Rows) -> Belief: ...
-    def write(self, rows: _Rows, belief: Belief) -> None: ...
-    def take(self, rows: _Rows) -> "_Store": ...
-    def copy_from(self, rows: _Rows, other: Any, other_rows: _Rows) -> None: ...
-    def step(
-        self,
-        rows: _Rows,
-        trans: Sequence[_Array | None],
-        F: _Array,
-        b: _Array | None,
-        Q: _Array,
-        mode: _Modes | None = None,
-    ) -> None: ...
-    def measure(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, mode: _Modes | None = None, *, write: bool
-    ) -> tuple[_Array, _Array]: ...
-    def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]: ...
-    def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]: ...
-    def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged: ...
-    def merge(self, rows: _Rows, copies: Any, start: _Rows, log_weights: _Array) -> None: ...
+    Raises:
+        ModelError: another shape.
+        DataError: an infinite one.
+    """
+    z = np.asarray(z, dtype=np.float64)
+    if z.ndim != 2 or len(z) != k or z.shape[1] == 0:
+        raise ModelError(f"z has shape {z.shape}; it is (k, m) with one measurement for each of {k} rows addressed.")
+    if np.isinf(z).any():
+        where = [int(i) for i in np.argwhere(np.isinf(z))[0]]
+        raise DataError(f"z{where} is infinite. A missing component is NaN.")
+    return z
 
 
-def _make_store(n: int, sizes: tuple[int, ...], capacity: int, backend: Backend | None) -> _Store:
+def _make_store(n: int, sizes: tuple[int, ...], capacity: int, backend: Backend | None) -> Store:
     fits = n <= MOST_STATES and prod(sizes) <= MOST_MODES
     if use_native(backend) and (backend == "native" or fits):
         from saltus.filters.native import NativeStore
 
         return NativeStore(n, sizes, capacity)
     return NumpyStore(n, sizes, capacity)
-
-
-class NumpyStore:
-    """Rows of NumPy arrays, (capacity, M1, ..., MC[, n[, n]]): the definition."""
-
-    def __init__(self, n: int, sizes: tuple[int, ...], capacity: int) -> None:
-        """Make room for `capacity` rows."""
-        self._sizes, self._n_chains = sizes, len(sizes)
-        self._log_probs = np.zeros((capacity, *sizes))
-        self._means = np.zeros((capacity, *sizes, n))
-        self._covs = np.zeros((capacity, *sizes, n, n))
-
-    def grow(self, capacity: int) -> None:
-        """Make room for more rows."""
-        self._log_probs = _enlarged(self._log_probs, capacity)
-        self._means = _enlarged(self._means, capacity)
-        self._covs = _enlarged(self._covs, capacity)
-
-    def read(self, rows: _Rows) -> Belief:
-        """Return copies of the rows' beliefs."""
-        return Belief(self._log_probs[rows], self._means[rows], self._covs[rows])
-
-    def write(self, rows: _Rows, belief: Belief) -> None:
-        """Overwrite rows."""
-        self._log_probs[rows], self._means[rows], self._covs[rows] = belief
-
-    def take(self, rows: _Rows) -> "NumpyStore":
-        """Return a store whose rows 0..k-1 are copies of `rows`."""
-        store = NumpyStore(self._means.shape[-1], self._sizes, 0)
-        store._log_probs, store._means, store._covs = self.read(rows)
-        return store
-
-    def copy_from(self, rows: _Rows, other: "NumpyStore", other_rows: _Rows) -> None:
-        """Overwrite rows with those of another store."""
-        self.write(rows, other.read(other_rows))
-
-    def step(
-        self,
-        rows: _Rows,
-        trans: Sequence[_Array | None],
-        F: _Array,
-        b: _Array | None,
-        Q: _Array,
-        mode: _Modes | None = None,
-    ) -> None:
-        """Mix and propagate rows."""
-        log_probs, means, covs = steps.mix(*self.read(rows), trans)
-        F, Q, b = _looked_up(F, mode), _looked_up(Q, mode), None if b is None else _looked_up(b, mode)
-        self.write(rows, Belief(log_probs, *steps.propagate(means, covs, F, b, Q)))
-
-    def measure(
-        self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, mode: _Modes | None = None, *, write: bool
-    ) -> tuple[_Array, _Array]:
-        """Return d2 and log f(z); condition the rows when `write`."""
-        H, R, d = _looked_up(H, mode), _looked_up(R, mode), None if d is None else _looked_up(d, mode)
-        log_probs, means, covs = self.read(rows)
-        seen = ~np.isnan(z)
-        z = np.where(seen, z, 0.0)
-        shape = (len(rows),) + (1,) * self._n_chains + z.shape[-1:]
-        prediction = steps.measure(means, covs, H, d, R)
-        done = steps.condition(prediction, z.reshape(shape), seen.reshape(shape))
-        d2 = steps.mixture_nis(log_probs, prediction, z, seen, self._n_chains)
-        log_probs, log_f = steps.reweigh(log_probs, done.loglik, self._n_chains)
-        if write:
-            self.write(rows, Belief(log_probs, done.mean, done.cov))
-        return d2, log_f
-
-    def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]:
-        """Return mean, covariance and mode probabilities of rows."""
-        belief = self.read(rows)
-        mean, cov = steps.collapse(*belief, self._n_chains)
-        return mean, cov, np.exp(belief.log_probs)
-
-    def expand(self, rows: _Rows, now: _Modes, trans: _Array, z: _Array, tables: Tables) -> tuple[_Array, _Array]:
-        """Return P(next mode | row, z) and log f(z | row)."""
-        return expanded(self._means[rows], self._covs[rows], now, trans, z, tables)
-
-    def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:
-        """Return total weight, mean and covariance of the rows of each label."""
-        return merged(self._means[rows], self._covs[rows], weights, labels, n_labels)
-
-    def merge(self, rows: _Rows, copies: "NumpyStore", start: _Rows, log_weights: _Array) -> None:
-        """Overwrite rows with mixtures of another store's rows 0, 1, ..., a group each."""
-        self.write(rows, merge_copies(copies.read(np.arange(len(log_weights))), start, log_weights))
-
-
-def _looked_up(table: _Array, mode: _Modes | None) -> _Array:
-    return table if mode is None or len(table) == 1 else table[mode]
-
-
-def _enlarged(a: _Array, rows: int) -> _Array:
-    out = np.zeros((rows, *a.shape[1:]))
-    out[: len(a)] = a
-    return out

@@ -18,9 +18,9 @@ from saltus.errors import DataError
 from saltus.filters import steps
 from saltus.filters.estimates import Estimates
 from saltus.filters.flat import Flat
-from saltus.filters.observation import innovation_nis
+from saltus.filters.observation import impossible, innovation_nis
 from saltus.filters.particles import effective_size, group_error, systematic
-from saltus.linalg import logsumexp, symmetric
+from saltus.linalg import normalised, symmetric
 from saltus.models import DiffusionSensor, SwitchingSDE
 from saltus.simulate import advance
 
@@ -142,23 +142,17 @@ def bootstrap(
         nis = _nis(moved, moves.n_modes, sensor, z[:, k], dts[k])
         before = None
         if auxiliary:  # the innovation is that of all, the update that of those drawn
-            drawn, before = _drawn_ahead(cloud, moves, sensor, k, seen, dts[k], rng)
+            drawn, before = _drawn_ahead(cloud, moves, sensor, k, z, dts[k], rng)
             moved = _moved(drawn, moves, k, rng)
         log_w = moved.log_w + _log_likelihood(moved, sensor, seen, dts[k]) - (0.0 if before is None else before.log_g)
-        log_f = logsumexp(log_w, (1,))
-        if not np.isfinite(log_f).all():
-            run = int(np.argmin(np.isfinite(log_f[:, 0]))) // groups
-            raise DataError(
-                f"row {k}: measurement {z[run, k]} of run {run} is impossible for every particle.\n"
-                "Check its unit, or take more particles."
-            )
-        cloud = moved._replace(log_w=log_w - log_f)
+        log_w, log_f = normalised(log_w, (1,))
+        _possible(log_f, moved, moves, sensor, z, k)
+        cloud = moved._replace(log_w=log_w)
         evidence = log_f[:, 0] + (0.0 if before is None else before.log_f)
         told = log_group + evidence.reshape(B, groups)
-        total = logsumexp(told, (1,))
-        rows.append(_row(cloud, moves.n_modes, told - total, total[:, 0], nis))
-        log_group = _REMEMBERED * (told - total)
-        log_group = log_group - logsumexp(log_group, (1,))
+        told, total = normalised(told, (1,))
+        rows.append(_row(cloud, moves.n_modes, told, total[:, 0], nis))
+        log_group, _ = normalised(_REMEMBERED * told, (1,))
         cloud = _drawn_anew(cloud, rng)
     stacked = _Row(*(np.stack(parts, axis=1) for parts in zip(*rows, strict=True)))
     return Estimates(
@@ -193,21 +187,35 @@ def _log_likelihood(cloud: _Cloud, sensor: DiffusionSensor, seen: _Array, dt: fl
     return out.reshape(lots, size)
 
 
+def _possible(log_f: _Array, cloud: _Cloud, moves: Moves, sensor: DiffusionSensor, z: _Array, k: int) -> None:
+    """Refuse a measurement that is impossible for every particle of a group."""
+    if np.isfinite(log_f).all():
+        return
+    lot = int(np.argmin(np.isfinite(log_f[:, 0])))
+    run = lot * len(z) // len(cloud.mode)
+    told = impossible(
+        sensor, z[run, k], [(i, cloud.x[lot, cloud.mode[lot] == i]) for i in range(moves.n_modes)], run, k
+    )
+    raise DataError(f"{told} is impossible for every particle.\nCheck its unit, or take more particles.")
+
+
 class _Ahead(NamedTuple):
     log_g: _Array  # (lots, size): by what the particles drawn were weighed
     log_f: _Array  # (lots,)
 
 
 def _drawn_ahead(
-    cloud: _Cloud, moves: Moves, sensor: DiffusionSensor, k: int, seen: _Array, dt: float, rng: np.random.Generator
+    cloud: _Cloud, moves: Moves, sensor: DiffusionSensor, k: int, z: _Array, dt: float, rng: np.random.Generator
 ) -> tuple[_Cloud, _Ahead]:
     lots, size = cloud.mode.shape
+    seen = np.repeat(z[:, k], lots // len(z), axis=0)
     ahead = moves.guess(k, cloud.mode.ravel(), cloud.x.reshape(lots * size, -1))
     # Half the log: a state without its noise is a doubtful witness, and weights stay bounded.
     log_g = 0.5 * _log_likelihood(cloud, sensor, seen, dt, ahead)
     first = cloud.log_w + log_g
-    log_f = logsumexp(first, (1,))
-    taken = systematic(np.exp(first - log_f), rng)
+    log_share, log_f = normalised(first, (1,))
+    _possible(log_f, cloud, moves, sensor, z, k)
+    taken = systematic(np.exp(log_share), rng)
     drawn = _Cloud(
         np.take_along_axis(cloud.mode, taken, 1),
         np.take_along_axis(cloud.x, taken[..., None], 1),

@@ -11,13 +11,13 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from saltus.errors import NumericalError
 from saltus.filters.align import Aligned
 from saltus.filters.backend import Backend, check_settings, fits_kernel, use_native
 from saltus.filters.coloured_model import Augmented, Differenced, augment, difference, factored
 from saltus.filters.differencing import aligned_samples, filter_differenced, known_exactly, measured, read, start
 from saltus.filters.estimates import Estimates
-from saltus.filters.imm import imm_filter
+from saltus.filters.imm import filter_aligned
+from saltus.filters.refusals import NotPositive
 
 __all__ = ["after_first", "augmented_filter", "coloured_filter", "of_state", "run_augmented", "run_differenced"]
 
@@ -162,21 +162,8 @@ def run_augmented(
         return after_first(filter_native(whole, aligned, run))
     data = read(whole, aligned(False))
     first, log_start, _ = start(data, np.eye(model.F.shape[-1]))
-    done = imm_filter(
-        whole[..., 1:, :],
-        F=model.F,
-        Q=model.Q,
-        b=model.b,
-        H=data.aligned.H[data.first],
-        R=data.aligned.R[data.first],
-        trans=trans,
-        mean0=first.means,
-        cov0=first.covs,
-        probs0=np.exp(first.log_probs),
-        per_mode=per_mode,
-        keep=keep,
-        backend="numpy",
-    )
+    later = data.aligned._replace(log_probs0=first.log_probs, mean0=first.means, cov0=first.covs)
+    done = filter_aligned(later, per_mode=per_mode, every=keep == "all", first=1)
     return replace(of_state(done, n), log_likelihood_start=log_start)
 
 
@@ -223,8 +210,8 @@ def run_differenced(
         data = read(whole, aligned(False))
         steps = moves._replace(Phi=data.aligned.F, B=data.aligned.Q, b=data.aligned.b)
         return filter_differenced(data, steps, n, per_mode=per_mode, every=keep == "all")
-    except NumericalError as error:
-        raise known_exactly(moves.B, whole.shape[-1], len(trans)) from error
+    except NotPositive as error:
+        raise known_exactly(error.where, moves.B, whole.shape[-1], len(trans)) from error
 
 
 def _differenced_native(

@@ -16,7 +16,8 @@ from saltus.errors import DataError, ModelError, NumericalError
 from saltus.filters import steps
 from saltus.filters.align import Aligned, align
 from saltus.filters.coloured_model import Augmented, Differenced
-from saltus.filters.estimates import Estimates
+from saltus.filters.estimates import Estimates, allocate
+from saltus.filters.refusals import check_finite
 
 __all__ = ["Samples", "aligned_samples", "filter_differenced", "known_exactly", "measured", "read", "start"]
 
@@ -24,24 +25,25 @@ _Array = npt.NDArray[np.float64]
 _Index = tuple[slice | int, ...]
 
 
-def known_exactly(B: _Array, m: int, n_chains: int) -> NumericalError:
+def known_exactly(where: str, B: _Array, m: int, n_chains: int) -> NumericalError:
     """The error of a measured component that was known exactly, with the first interval that brings one no noise.
 
     Args:
+        where: run, row and component.
         B: covariance of the noise of s, (T?, M1|1, ..., MC|1, n+p, n+p); its last m components are measured.
         m: number of measured components.
         n_chains: C.
     """
     none = np.argwhere(np.diagonal(B, axis1=-2, axis2=-1)[..., -m:] <= 0)
-    time, where = B.ndim - n_chains - 3, ""
+    time, source = B.ndim - n_chains - 3, ""
     if len(none):
         timed = time >= 0 and B.shape[time] > 1
         interval = f"the interval before row {none[0, time] + 1}" if timed else "any interval"
-        where = f" Component {none[0, -1]} gets no noise in {interval}."
+        source = f" Component {none[0, -1]} gets no noise in {interval}."
     return NumericalError(
-        "an innovation covariance is not positive definite: a measured component repeats what is known exactly."
-        f"{where} Two samples at one time, or noise_G = 0 where the state brings no noise either. Drop the repeated "
-        "sample, or give the noise a diffusion."
+        f"{where}: an innovation covariance is not positive definite: a measured component repeats what is known "
+        f"exactly.{source} Two samples at one time, or noise_G = 0 where the state brings no noise either. Drop the "
+        "repeated sample, or give the noise a diffusion."
     )
 
 
@@ -125,7 +127,9 @@ def filter_differenced(data: Samples, moves: Differenced, n: int, *, per_mode: b
     Raises:
         NumericalError: an innovation covariance is not positive definite.
     """
-    out, n_rows = _allocate(data, n, per_mode, every), data.z.shape[-2]
+    n_rows, batch, sizes = data.z.shape[-2], data.z.shape[:-2], data.aligned.sizes
+    out = allocate(batch, n_rows if every else 1, n_rows, sizes, n, per_mode)
+    out.n_observed[...] = data.seen.sum(-1)[..., -out.n_observed.shape[-1] :]
     runs = (slice(None),) * (data.z.ndim - 2)
     belief, log_f, d2 = start(data, moves.T[: moves.n_kept] if data.complete[0] else moves.T)
     belief = _pin(belief, data, 0, moves.n_kept)
@@ -139,6 +143,7 @@ def filter_differenced(data: Samples, moves: Differenced, n: int, *, per_mode: b
         out.probs[at], out.nis[at] = np.exp(belief.log_probs), d2
         means, covs = belief.means[..., :n], belief.covs[..., :n, :n]
         out.mean[at], out.cov[at] = steps.collapse(belief.log_probs, means, covs, len(data.aligned.trans))
+        check_finite(out.mean[at], out.cov[at], k)
         if out.mode_means is not None and out.mode_covs is not None:
             out.mode_means[at], out.mode_covs[at] = means, covs
     return out
@@ -157,17 +162,17 @@ def start(data: Samples, A: _Array) -> tuple[steps.Belief, _Array, _Array]:
     n = prior.mean0.shape[-1]
     mean0, cov0 = np.broadcast_to(prior.mean0, (*lead, n)), np.broadcast_to(prior.cov0, (*lead, n, n))
     prediction = steps.joint(mean0, cov0, A, None, first(prior.H), None, N)
-    done = steps.condition(prediction, *_per_mode(data, 0))
     log_probs0 = np.broadcast_to(prior.log_probs0, lead)
-    d2 = _nis(log_probs0, prediction, data, 0)
-    log_probs, log_f = steps.reweigh(log_probs0, done.loglik, len(prior.sizes))
-    return steps.Belief(log_probs, done.mean, np.broadcast_to(done.cov, (*lead, p, p))), log_f, d2
+    belief, log_f, d2 = _updated(log_probs0, prediction, data, 0)
+    return belief._replace(covs=np.broadcast_to(belief.covs, (*lead, p, p))), log_f, d2
 
 
-def _nis(log_probs: _Array, prediction: steps.Joint, data: Samples, k: int) -> _Array:
-    seen = data.seen[..., k, :]
+def _updated(log_probs: _Array, prediction: steps.Joint, data: Samples, k: int) -> tuple[steps.Belief, _Array, _Array]:
+    """Condition on row k of z; return belief, log f and NIS."""
+    seen, n_chains = data.seen[..., k, :], len(data.aligned.trans)
     z = np.where(seen, data.z[..., k, :], 0.0)
-    return steps.mixture_nis(log_probs, prediction, z, seen, len(data.aligned.trans))
+    d2 = steps.mixture_nis(log_probs, prediction, z, seen, n_chains)
+    return *steps.update(log_probs, prediction, z, seen, n_chains, k), d2
 
 
 def _step(data: Samples, moves: Differenced, belief: steps.Belief, k: int) -> tuple[steps.Belief, _Array, _Array]:
@@ -191,10 +196,8 @@ def _step(data: Samples, moves: Differenced, belief: steps.Belief, k: int) -> tu
         A, C = A[..., :kept], C[..., :kept]
     order = np.r_[np.arange(Phi.shape[-1])[into], np.arange(kept, Phi.shape[-1])]
     prediction = steps.joint(means, covs, A, b, C, d, B[..., order[:, None], order])
-    done = steps.condition(prediction, *_per_mode(data, k + 1))
-    d2 = _nis(log_probs, prediction, data, k + 1)
-    log_probs, log_f = steps.reweigh(log_probs, done.loglik, len(model.trans))
-    return _pin(steps.Belief(log_probs, done.mean, done.cov), data, k + 1, kept), log_f, d2
+    belief, log_f, d2 = _updated(log_probs, prediction, data, k + 1)
+    return _pin(belief, data, k + 1, kept), log_f, d2
 
 
 def _pin(belief: steps.Belief, data: Samples, k: int, kept: int) -> steps.Belief:
@@ -219,23 +222,6 @@ def _per_mode(data: Samples, k: int) -> tuple[_Array, npt.NDArray[np.bool_]]:
     z, seen = data.z[..., k, :], data.seen[..., k, :]
     shape = z.shape[:-1] + (1,) * len(data.aligned.trans) + z.shape[-1:]
     return np.where(seen, z, 0.0).reshape(shape), seen.reshape(shape)
-
-
-def _allocate(data: Samples, n: int, per_mode: bool, every: bool) -> Estimates:
-    batch, sizes, n_rows = data.z.shape[:-2], data.aligned.sizes, data.z.shape[-2]
-    rows = (*batch, n_rows if every else 1)
-    n_observed = data.seen.sum(-1).astype(float)
-    return Estimates(
-        probs=np.empty((*rows, *sizes)),
-        mean=np.empty((*rows, n)),
-        cov=np.empty((*rows, n, n)),
-        log_likelihood=np.empty((*batch, n_rows)),
-        log_likelihood_start=np.zeros(batch),
-        nis=np.empty(rows),
-        n_observed=n_observed if every else n_observed[..., -1:],
-        mode_means=np.empty((*rows, *sizes, n)) if per_mode else None,
-        mode_covs=np.empty((*rows, *sizes, n, n)) if per_mode else None,
-    )
 
 
 def _row(k: int, axis: int, a: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -11,7 +11,7 @@ from saltus.models.findings import Finding, per_interval
 from saltus.models.hybrid import HybridModel
 from saltus.shapes import Float
 
-__all__ = ["Estimates", "described"]
+__all__ = ["Estimates", "allocate", "described"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,3 +110,22 @@ def described(found: Estimates, model: HybridModel, times: Float[np.ndarray, " t
     """Add what the model and the times of the rows say of estimates: names, times, findings."""
     names = tuple(chain.name for chain in model.chains)
     return replace(found, chains=names, times=times, findings=tuple(per_interval(model, times)))
+
+
+def allocate(
+    batch: tuple[int, ...], kept: int, n_steps: int, sizes: tuple[int, ...], n: int, per_mode: bool
+) -> Estimates:
+    """Make room for estimates without errors: rows to fill for runs of n_steps, `kept` of them with moments."""
+    # Arrays apart: the allocator gives the smaller ones out again without new pages, which one large piece forgoes.
+    rows = (*batch, kept)
+    return Estimates(
+        probs=np.empty((*rows, *sizes)),
+        mean=np.empty((*rows, n)),
+        cov=np.empty((*rows, n, n)),
+        log_likelihood=np.empty((*batch, n_steps)),
+        log_likelihood_start=np.zeros(batch),
+        nis=np.empty(rows),
+        n_observed=np.empty(rows),
+        mode_means=np.empty((*rows, *sizes, n)) if per_mode else None,
+        mode_covs=np.empty((*rows, *sizes, n, n)) if per_mode else None,
+    )

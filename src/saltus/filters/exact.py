@@ -34,7 +34,7 @@ from saltus.filters.estimates import Estimates, described
 from saltus.filters.flat import Flat, flatten
 from saltus.filters.histories import EXACT, Histories, MergingRule, merged
 from saltus.filters.run import Record, in_order
-from saltus.linalg import logsumexp
+from saltus.linalg import logsumexp, normalised
 from saltus.models import HybridModel, Observer
 
 __all__ = ["ExactFilter", "exact_filter"]
@@ -206,10 +206,9 @@ def _update(now: Histories, modes: _Codes, flat: Flat, k: int) -> tuple[Historie
     if not seen.any():
         return now._replace(means=means, covs=covs), np.zeros(len(z)), np.zeros(len(z))
     prediction = steps.measure(means, covs, H, d, R)
-    done = steps.condition(prediction, z[:, None], seen[:, None])
     nis = steps.mixture_nis(log_probs, prediction, z, seen, 1)
-    log_probs, log_f = steps.reweigh(log_probs, done.loglik, 1)
-    return Histories(log_probs[..., None], now.codes, done.mean, done.cov), log_f, nis
+    belief, log_f = steps.update(log_probs, prediction, z, seen, 1, k)
+    return Histories(belief.log_probs[..., None], now.codes, belief.means, belief.covs), log_f, nis
 
 
 def _row(
@@ -240,13 +239,12 @@ def _reduced(now: Histories, modes: _Codes, n_modes: int, rule: MergingRule) -> 
     newest = np.broadcast_to(modes, (B, H))
     if rule.most is not None and rule.most < H:
         order = np.argsort(-now.log_probs[..., 0], axis=1, kind="stable")[:, : rule.most]
-        log_probs = np.take_along_axis(now.log_probs, order[..., None], 1)
-        kept = logsumexp(log_probs[..., 0], (1,))
-        lost = np.maximum(0.0, -kept[:, 0])
+        log_probs, kept = normalised(np.take_along_axis(now.log_probs, order[..., None], 1), (1,))
+        lost = np.maximum(0.0, -kept[:, 0, 0])
         newest, codes = np.take_along_axis(newest, order, 1), np.take_along_axis(now.codes, order, 1)
         means = np.take_along_axis(now.means, order[..., None], 1)
         covs = np.take_along_axis(now.covs, order[..., None, None], 1)
-        now = Histories(log_probs - kept[..., None], codes, means, covs)
+        now = Histories(log_probs, codes, means, covs)
     log_law = np.where(newest[..., None] == np.arange(n_modes), now.log_probs, -np.inf)
     if rule.last is None or rule.before:
         return now._replace(log_probs=log_law), lost

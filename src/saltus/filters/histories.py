@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from saltus.errors import ModelError
 from saltus.filters import steps
-from saltus.linalg import logsumexp
+from saltus.linalg import normalised
 
 __all__ = ["EXACT", "GPB1", "GPB2", "INTERACTING", "Histories", "MergingRule", "merged"]
 
@@ -91,7 +91,7 @@ def merged(now: Histories, n_groups: int) -> tuple[Histories, _Array]:
     share = share / np.where(reached, scale, 1.0)[into]
     with np.errstate(divide="ignore"):
         group_log_probs = (np.log(scale) + np.where(reached, top, 0.0)).reshape(B, n_groups)
-    mean, cov = steps.collapse(log_probs - logsumexp(log_probs, (1,)), now.means, now.covs, 1)
+    mean, cov = steps.collapse(normalised(log_probs, (1,))[0], now.means, now.covs, 1)
     there = reached.reshape(B, n_groups)
     means = np.where(there[..., None], total(share[..., None] * now.means), mean[:, None])
     spread = now.means - means.reshape(-1, n)[into]

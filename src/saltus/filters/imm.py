@@ -10,9 +10,10 @@ import numpy.typing as npt
 from saltus.filters import steps
 from saltus.filters.align import Aligned, align
 from saltus.filters.backend import Backend, check_settings, fits_kernel, use_native
-from saltus.filters.estimates import Estimates
+from saltus.filters.estimates import Estimates, allocate
+from saltus.filters.refusals import check_finite
 
-__all__ = ["imm_filter"]
+__all__ = ["filter_aligned", "imm_filter"]
 
 _Array = npt.NDArray[np.float64]
 _Index = tuple[slice | int, ...]
@@ -81,50 +82,39 @@ def imm_filter(
 
         run = Run(per_mode=per_mode, every=keep == "all", num_threads=num_threads)
         return filter_native(np.asarray(z, dtype=np.float64), aligned, run)
-    return _filter(aligned(False), per_mode=per_mode, every=keep == "all")
+    return filter_aligned(aligned(False), per_mode=per_mode, every=keep == "all")
 
 
-def _filter(model: Aligned, *, per_mode: bool, every: bool) -> Estimates:
-    n_chains, n_steps = len(model.trans), model.z.shape[-2]
-    batch, sizes, n = model.z.shape[:-2], model.sizes, model.cov0.shape[-1]
-    lead = (*batch, *sizes)
+def filter_aligned(model: Aligned, *, per_mode: bool, every: bool, first: int = 0) -> Estimates:
+    """Filter by the definition; rows are counted from `first` in messages."""
+    n_chains, n_steps, batch = len(model.trans), model.z.shape[-2], model.z.shape[:-2]
+    lead, n = (*batch, *model.sizes), model.cov0.shape[-1]
     belief = steps.Belief(
         np.broadcast_to(model.log_probs0, lead),
         np.broadcast_to(model.mean0, (*lead, n)),
         np.broadcast_to(model.cov0, (*lead, n, n)),
     )
-    kept = n_steps if every else 1
-    mean, cov = np.empty((*batch, kept, n)), np.empty((*batch, kept, n, n))
-    log_probs, nis = np.empty((*batch, kept, *sizes)), np.empty((*batch, kept))
-    mode_means = np.empty((*batch, kept, *sizes, n)) if per_mode else None
-    mode_covs = np.empty((*batch, kept, *sizes, n, n)) if per_mode else None
-    log_likelihood = np.empty((*batch, n_steps))
+    out = allocate(batch, n_steps if every else 1, n_steps, model.sizes, n, per_mode)
+    out.n_observed[...] = model.seen.sum(-1)[..., -out.n_observed.shape[-1] :]
     rows: tuple[slice, ...] = (slice(None),) * len(batch)
     for k in range(n_steps):
-        belief, log_f, d2 = _step(model, belief, k, n_chains, want_nis=every or k == n_steps - 1)
-        log_likelihood[..., k] = log_f
-        if every or k == n_steps - 1:
+        wanted = every or k == n_steps - 1
+        with np.errstate(over="ignore", invalid="ignore"):  # what has overflowed is refused, with its run and row
+            belief, log_f, d2 = _step(model, belief, k, n_chains, wanted, first)
+            out.log_likelihood[..., k] = log_f
+            if not wanted:
+                continue
             at: _Index = (*rows, k if every else 0)
-            mean[at], cov[at] = steps.collapse(*belief, n_chains)
-            log_probs[at], nis[at] = belief.log_probs, d2
-            if mode_means is not None and mode_covs is not None:
-                mode_means[at], mode_covs[at] = belief.means, belief.covs
-    n_observed = model.seen.sum(-1).astype(float)
-    return Estimates(
-        probs=np.exp(log_probs),
-        mean=mean,
-        cov=cov,
-        log_likelihood=log_likelihood,
-        log_likelihood_start=np.zeros(batch),
-        nis=nis,
-        n_observed=n_observed if every else n_observed[..., -1:],
-        mode_means=mode_means,
-        mode_covs=mode_covs,
-    )
+            out.mean[at], out.cov[at] = steps.collapse(*belief, n_chains)
+        check_finite(out.mean[at], out.cov[at], k + first)
+        out.probs[at], out.nis[at] = np.exp(belief.log_probs), d2
+        if out.mode_means is not None and out.mode_covs is not None:
+            out.mode_means[at], out.mode_covs[at] = belief.means, belief.covs
+    return out
 
 
 def _step(
-    model: Aligned, belief: steps.Belief, k: int, n_chains: int, want_nis: bool
+    model: Aligned, belief: steps.Belief, k: int, n_chains: int, want_nis: bool, first: int
 ) -> tuple[steps.Belief, _Array, _Array | float]:
     at = partial(_row, k, model.z.ndim - 2)
     trans = [None if t is None else at(t) for t in model.trans]
@@ -135,11 +125,9 @@ def _step(
         zero = np.zeros(model.z.shape[:-2])
         return steps.Belief(log_probs, means, covs), zero, zero
     prediction = steps.measure(means, covs, at(model.H), None if model.d is None else at(model.d), at(model.R))
-    per_mode = z.shape[:-1] + (1,) * n_chains + z.shape[-1:]
-    done = steps.condition(prediction, z.reshape(per_mode), seen.reshape(per_mode))
     d2 = steps.mixture_nis(log_probs, prediction, z, seen, n_chains) if want_nis else 0.0
-    log_probs, log_f = steps.reweigh(log_probs, done.loglik, n_chains)
-    return steps.Belief(log_probs, done.mean, done.cov), log_f, d2
+    belief, log_f = steps.update(log_probs, prediction, z, seen, n_chains, k + first)
+    return belief, log_f, d2
 
 
 def _row(k: int, axis: int, a: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.compiled import native_module
-from saltus.errors import ModelError, NumericalError
+from saltus.errors import ModelError, SaltusError
 from saltus.filters.align import Aligned
 from saltus.filters.backend import instruction_set, thread_count
-from saltus.filters.estimates import Estimates
+from saltus.filters.estimates import Estimates, allocate
 from saltus.filters.particles import Merged, Tables
-from saltus.filters.steps import NOT_POSITIVE, Belief
+from saltus.filters.refusals import NotPositive, not_finite, place, too_far
+from saltus.filters.steps import Belief
 
 __all__ = ["NativeStore", "Run", "filter_native"]
 
@@ -22,7 +23,7 @@ _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
 _Modes = npt.NDArray[np.int64]
 
-_NOT_POSITIVE, _INFINITE, _DOUBTFUL = 1, 2, 4  # bits of the kernel's status
+_NOT_POSITIVE, _INFINITE, _DOUBTFUL, _NOT_FINITE = 1, 2, 4, 16  # bits of the kernel's status
 _WRITTEN = ("probs", "mean", "cov", "log_likelihood", "nis", "n_observed", "mode_means", "mode_covs")
 
 
@@ -46,53 +47,49 @@ def filter_native(z: _Array, aligned: Callable[[bool], Aligned], run: Run) -> Es
         aligned: aligns the other arguments; True leaves the elements of large arrays to the kernel.
         run: its settings.
     """
-    out, status = _run(z, aligned(True), run)
+    out, faults, status = _run(z, aligned(True), run)
     if status & (_DOUBTFUL | _INFINITE):  # read every element: raises, or makes nearly symmetric covariances symmetric
-        out, status = _run(z, aligned(False), run)
-    if status & _NOT_POSITIVE:
-        raise NumericalError(NOT_POSITIVE)
+        out, faults, status = _run(z, aligned(False), run)
+    bad = np.flatnonzero(faults[:, 0])
+    if len(bad):
+        first, batch = int(bad[0]), z.shape[:-2]
+        where = tuple(int(i) for i in np.unravel_index(first, batch)) if batch else ()
+        raise _refusal(faults[first], z[where], len(faults) - len(bad), where)
     return out
 
 
-def _run(z: _Array, model: Aligned, run: Run) -> tuple[Estimates, int]:
+def _refusal(fault: _Modes, z: _Array, others: int, run: tuple[int, ...] = ()) -> SaltusError:
+    """What a fault of the kernel means: its kind, row and component, with the (T, m) it happened in."""
+    kind, row, component = (int(i) for i in fault)
+    if kind == _NOT_POSITIVE:
+        return NotPositive(place(run, row, component))
+    if kind == _NOT_FINITE:
+        return not_finite(place(run, row))
+    return too_far(place(run, row, component), float(z[row, component]), others)
+
+
+def _run(z: _Array, model: Aligned, run: Run) -> tuple[Estimates, _Modes, int]:
     native = native_module()
     if native is None:
         raise ModelError("there is no compiled kernel here.")
     batch, (n_steps, m) = z.shape[:-2], z.shape[-2:]
     sizes, n, runs = model.sizes, model.cov0.shape[-1], prod(z.shape[:-2])
     reported = n if run.reported is None else run.reported
-    out = _allocate(batch, n_steps if run.every else 1, n_steps, sizes, reported, run.per_mode)
+    out = allocate(batch, n_steps if run.every else 1, n_steps, sizes, reported, run.per_mode)
+    faults = np.zeros((runs, 3), np.int64)
     if runs == 0:
-        return out, 0
+        return out, faults, 0
     work = float(runs) * n_steps * prod(sizes) * n * n * (n + m)
     described = {"reported": reported, "from_first": run.from_first, "map": run.map}
     status = native.imm_filter(
         instruction_set(),
         np.ascontiguousarray(z.reshape((runs, n_steps, m))),
         _described(model, batch) | described,
-        {name: getattr(out, name) for name in _WRITTEN},
+        {name: getattr(out, name) for name in _WRITTEN} | {"faults": faults},
         run.every,
         thread_count(run.num_threads, work),
     )
-    return out, status
-
-
-def _allocate(
-    batch: tuple[int, ...], kept: int, n_steps: int, sizes: tuple[int, ...], n: int, per_mode: bool
-) -> Estimates:
-    # Arrays apart: the allocator gives the smaller ones out again without new pages, which one large piece forgoes.
-    rows = (*batch, kept)
-    return Estimates(
-        probs=np.empty((*rows, *sizes)),
-        mean=np.empty((*rows, n)),
-        cov=np.empty((*rows, n, n)),
-        log_likelihood=np.empty((*batch, n_steps)),
-        log_likelihood_start=np.zeros(batch),
-        nis=np.empty(rows),
-        n_observed=np.empty(rows),
-        mode_means=np.empty((*rows, *sizes, n)) if per_mode else None,
-        mode_covs=np.empty((*rows, *sizes, n, n)) if per_mode else None,
-    )
+    return out, faults, status
 
 
 def _described(model: Aligned, batch: tuple[int, ...]) -> dict[str, object]:
@@ -183,8 +180,9 @@ class NativeStore:
         """Return d2 and log f(z); condition the rows when `write`."""
         d2, log_f = np.empty(len(rows)), np.empty(len(rows))
         by_mode = _looked_up(H, mode), None if d is None else _looked_up(d, mode), _looked_up(R, mode)
-        if self._lanes.measure(rows, write, z, *by_mode, d2, log_f) & _NOT_POSITIVE:
-            raise NumericalError(NOT_POSITIVE)
+        fault = self._lanes.measure(rows, write, z, *by_mode, d2, log_f)
+        if fault[0]:
+            raise _refusal(np.array(fault), z, len(rows) - 1)
         return d2, log_f
 
     def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]:
@@ -199,8 +197,9 @@ class NativeStore:
         law, log_f = np.empty((len(rows), len(trans))), np.empty(len(rows))
         F, b, Q, H, d, R = tables
         same = tables.same(len(trans))
-        if self._lanes.expand(rows, now, same, trans, z, F, b, Q, H, d, R, law, log_f) & _NOT_POSITIVE:
-            raise NumericalError(NOT_POSITIVE)
+        fault = self._lanes.expand(rows, now, same, trans, z, F, b, Q, H, d, R, law, log_f)
+        if fault[0]:
+            raise _refusal(np.array(fault), z, len(rows) - 1)
         return law, log_f
 
     def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:

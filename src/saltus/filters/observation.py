@@ -11,7 +11,7 @@ from saltus.linalg import gaussian_terms
 from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE, as_diffusion
 from saltus.shapes import Bool, Float
 
-__all__ = ["Observation", "elapsed", "innovation_nis", "measured", "observation"]
+__all__ = ["Observation", "elapsed", "impossible", "innovation_nis", "measured", "observation"]
 
 
 class Observation(NamedTuple):
@@ -93,6 +93,35 @@ def elapsed(times: Float[np.ndarray, " t"], t0: float) -> Float[np.ndarray, " t"
     return dts
 
 
+def impossible(
+    sensor: DiffusionSensor,
+    z: Float[np.ndarray, " m"],
+    states: Sequence[tuple[int, Float[np.ndarray, "_ n"]]],
+    run: int,
+    row: int,
+) -> str:
+    """Name a measurement that no state explains, and the component of it that is farthest from the nearest state.
+
+    Args:
+        sensor: what is measured.
+        z: one measurement; NaN is missing.
+        states: mode, and states in it.
+        run: number of the run.
+        row: number of the row.
+    """
+    nearest, component = np.inf, int(np.argmin(np.isnan(z)))
+    for mode, x in states:
+        if not len(x):
+            continue
+        sigma = np.sqrt(np.diagonal(sensor.noise_at(mode, x), axis1=-2, axis2=-1))
+        nu = z - sensor.h_at(mode, x) if sensor.continuous else sensor.residual(z, sensor.h_at(mode, x))
+        away = np.where(np.isnan(z), 0.0, np.abs(nu) / sigma)
+        least = away.max(axis=-1).argmin()
+        if away[least].max() < nearest:
+            nearest, component = away[least].max(), int(away[least].argmax())
+    return f"row {row}: measurement {z} of run {run}, component {component},"
+
+
 def innovation_nis(
     sensor: DiffusionSensor,
     z: Float[np.ndarray, "b m"],
@@ -110,19 +139,23 @@ def innovation_nis(
     seen = ~np.isnan(z)
     filled = np.where(seen, z, 0.0)[:, None]
     m = z.shape[-1]
-    nu, S = np.zeros((len(z), m)), np.zeros((len(z), m, m))
+    off, weights, S = [], [], np.zeros((len(z), m, m))
     for mode, (x, weight) in enumerate(nodes):
         h = sensor.h_at(mode, x)
-        off = filled - dt * h if sensor.continuous else sensor.residual(filled, h)
-        weighted = weight[..., None] * off
-        nu += weighted.sum(1)
-        S += np.swapaxes(weighted, -1, -2) @ off
+        off.append(filled - dt * h if sensor.continuous else sensor.residual(filled, h))
+        weights.append(weight[..., None])
         noise = sensor.R[mode]
         if callable(noise):
             S += np.einsum("bq,...qij->bij", weight, sensor.noise_at(mode, x))
         else:
             S += weight.sum(-1)[:, None, None] * np.asarray(noise) * (dt if sensor.continuous else 1.0)
-    S -= nu[:, :, None] * nu[:, None, :]
-    both = seen[:, :, None] & seen[:, None, :]
-    S = np.where(both, S, np.eye(m))
-    return np.where(seen.any(-1), gaussian_terms(np.where(seen, nu, 0.0), S)[0], 0.0)
+    nu = np.asarray(sum((w * e).sum(1) for w, e in zip(weights, off, strict=True)))
+    with np.errstate(over="ignore", invalid="ignore"):
+        # About the mean: squares of what is left, where raw second moments of an outlier would leave their rounding.
+        for w, e in zip(weights, off, strict=True):
+            left = e - nu[:, None]
+            S += np.swapaxes(w * left, -1, -2) @ left
+    known = np.asarray(np.isfinite(S).all(axis=(-1, -2)))
+    S = np.where(seen[:, :, None] & seen[:, None, :] & known[:, None, None], S, np.eye(m))
+    d2 = gaussian_terms(np.where(seen & known[:, None], nu, 0.0), S)[0]
+    return np.where(seen.any(-1), np.where(known, d2, np.inf), 0.0)

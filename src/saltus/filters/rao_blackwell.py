@@ -28,7 +28,8 @@ from saltus.filters.bank import Bank
 from saltus.filters.estimates import Estimates
 from saltus.filters.flat import Flat, flatten
 from saltus.filters.particles import Tables, effective_size, generator, group_error
-from saltus.linalg import logsumexp
+from saltus.filters.refusals import check_evidence
+from saltus.linalg import logsumexp, normalised
 
 __all__ = ["check_groups", "particle_filter"]
 
@@ -163,15 +164,17 @@ def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backen
         tables, trans = _tables(flat, k), flat.trans(k)[0]
         z = np.repeat(z_all[:, k], groups * size, axis=0)
         law, log_f = bank.expand(rows, mode, trans, z, tables)
-        first = log_f.reshape(lots, size)
-        likelihood = logsumexp(first, (1,))
-        share = np.exp(first - likelihood)
+        prediction, law_now = _predicted(now, flat, k)
+        first, likelihood = normalised(log_f.reshape(lots, size), (1,))
+        least = likelihood.reshape(B, groups).min(-1)
+        check_evidence(least, prediction.y, prediction.Y, flat.z[:, k], flat.seen[:, k], k)
+        share = np.exp(first)
         probs = (share[:, None, :] @ law.reshape(lots, size, M))[:, 0]
         bank, mode = _drawn(bank, share, law, rng)
         F, b, Q, H, d, R = tables
         bank.step(rows, [], F, b, Q, mode=mode)
         bank.update(rows, z, H, d, R, mode=mode)
-        nis = _nis(now, flat, k)
+        nis = steps.mixture_nis(law_now, prediction, flat.z[:, k], flat.seen[:, k], 1)
         now, group_means, mean, cov = _moments(bank, rows, weights, of_lot * M + mode, (B, groups, M))
         log_f_runs = logsumexp(likelihood.reshape(B, groups), (1,))[:, 0] - np.log(groups * size)
         out.append(
@@ -248,15 +251,11 @@ def _moments(
     return steps.Belief(total - np.log(G), *merged), groups[0], mean, cov
 
 
-def _nis(now: steps.Belief, flat: Flat, k: int) -> _Array:
-    """Distance of the measurement from its prediction; merging by mode leaves the prediction's two moments exact."""
-    seen = flat.seen[:, k]
-    if not seen.any():
-        return np.zeros(flat.n_runs)
+def _predicted(now: steps.Belief, flat: Flat, k: int) -> tuple[steps.Joint, _Array]:
+    """Predict row k in every mode, and the modes; merging by mode leaves the prediction's two moments exact."""
     log_probs, means, covs = steps.mix(*now, [flat.trans(k)])
     F, b, Q, H, d, R = flat.matrices(k, np.arange(flat.n_modes))
-    prediction = steps.measure(*steps.propagate(means, covs, F, b, Q), H, d, R)
-    return steps.mixture_nis(log_probs, prediction, flat.z[:, k], seen, 1)
+    return steps.measure(*steps.propagate(means, covs, F, b, Q), H, d, R), log_probs
 
 
 def _estimates(rows: _Rows, flat: Flat, batch: tuple[int, ...], per_mode: bool) -> Estimates:

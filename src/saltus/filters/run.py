@@ -13,6 +13,7 @@ from saltus.filters.coloured_run import filter_coloured
 from saltus.filters.estimates import Estimates, described
 from saltus.filters.imm import imm_filter
 from saltus.filters.linearise import Linearisation, sensor_update
+from saltus.filters.refusals import check_evidence
 from saltus.models import Arrays, BoundSensor, HybridModel, LinearSensor, Observer
 from saltus.models.augment import coloured_sensors
 
@@ -120,12 +121,12 @@ class IMM:
         for k, record in enumerate(records):
             sensor = _sensor_of(sensors, record, k)
             z = _checked(record, sensor, k)
-            row = self._step(_predicted(belief, arrays, k), sensor, z)
+            row = self._step(_predicted(belief, arrays, k), sensor, z, k)
             belief = row.belief
             rows.append(row)
         return _estimates(rows, self.per_mode)
 
-    def _step(self, belief: steps.Belief, sensor: BoundSensor, z: _Array) -> "_Row":
+    def _step(self, belief: steps.Belief, sensor: BoundSensor, z: _Array, k: int) -> "_Row":
         """Condition every mode on one measurement, and the modes."""
         seen, n_chains = ~np.isnan(z), belief.log_probs.ndim
         if not seen.any():
@@ -142,6 +143,7 @@ class IMM:
         )
         nis = steps.mixture_nis(belief.log_probs, prediction, z, seen, n_chains)
         log_probs, log_f = steps.reweigh(belief.log_probs, done.loglik, n_chains)
+        check_evidence(log_f, prediction.y, prediction.Y, z, seen, k)
         return _Row(steps.Belief(log_probs, done.mean, done.cov), float(log_f), float(nis), int(seen.sum()))
 
 

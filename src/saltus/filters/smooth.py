@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.errors import NumericalError
 from saltus.filters import steps
 from saltus.filters.align import Aligned
-from saltus.linalg import gaussian_terms, logsumexp, symmetric
+from saltus.filters.refusals import NotPositive, check_evidence, place
+from saltus.linalg import gaussian_terms, logsumexp, normalised, symmetric
 
 __all__ = ["Message", "Passed", "Smoothed", "forward", "smooth", "smooth_lag"]
 
@@ -118,9 +118,12 @@ def _row(model: Aligned, before: steps.Belief, k: int, n_chains: int) -> Passed:
     prediction = steps.measure(means, covs, H, None if model.d is None else at(model.d), R)
     z, seen = at(model.z), at(model.seen)
     per_mode = z.shape[:-1] + (1,) * n_chains + z.shape[-1:]
-    done = steps.condition(prediction, z.reshape(per_mode), seen.reshape(per_mode))
+    done = steps.condition(
+        prediction, z.reshape(per_mode), seen.reshape(per_mode), n_runs=log_probs.ndim - n_chains, row=k
+    )
     d2 = steps.mixture_nis(log_probs, prediction, z, seen, n_chains)
     posterior_log, log_f = steps.reweigh(log_probs, done.loglik, n_chains)
+    check_evidence(log_f, prediction.y, prediction.Y, z, seen, k)
     lead, n = log_probs.shape, means.shape[-1]
     score, information, through = _adjoint(prediction, z.reshape(per_mode), seen.reshape(per_mode), F, H)
     return Passed(
@@ -149,7 +152,7 @@ def _adjoint(
     try:
         _, _, L_inv = gaussian_terms(nu, S)
     except np.linalg.LinAlgError as error:
-        raise NumericalError(steps.NOT_POSITIVE) from error
+        raise NotPositive(place()) from error
     HF = (H @ F) * on[..., None]
     white = L_inv @ HF
     gain = (prediction.U * on[..., None, :]) @ L_inv.swapaxes(-1, -2) @ L_inv
@@ -216,7 +219,7 @@ def _output(passed: Passed, row: _Rows, message: Message) -> steps.Belief:
     total = log_p + message.c
     axes = tuple(range(total.ndim - passed.n_chains, total.ndim))
     covs = R - R @ message.curvature @ R
-    return steps.Belief(total - logsumexp(total, axes), x + (R @ message.a[..., None])[..., 0], symmetric(covs))
+    return steps.Belief(normalised(total, axes)[0], x + (R @ message.a[..., None])[..., 0], symmetric(covs))
 
 
 def _back(passed: Passed, row: _Rows, message: Message, floor: float) -> tuple[Message, list[_Array | None]]:
@@ -286,7 +289,7 @@ def _unmix(
     joint = lp[..., None] + w
     spectators = tuple(range(joint.ndim - 1 - n_chains, joint.ndim - 2))
     pairs = np.squeeze(logsumexp(joint, spectators), spectators) if spectators else joint
-    pairs = np.exp(pairs - logsumexp(pairs, (pairs.ndim - 2, pairs.ndim - 1)))
+    pairs = np.exp(normalised(pairs, (pairs.ndim - 2, pairs.ndim - 1))[0])
     put = (np.moveaxis(v, -1 - k, place) for k, v in ((0, c_i[..., 0]), (1, a_i), (2, guarded), (2, curvature)))
     return Message(*put), pairs
 

@@ -15,13 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saltus.errors import NumericalError
-from saltus.linalg import gaussian_terms, logsumexp, quadratic_form, symmetric
+from saltus.filters.refusals import NotPositive, check_evidence, place
+from saltus.linalg import cholesky, normalised, symmetric
 from saltus.shapes import Bool, Float
 
 __all__ = [
     "FLOOR",
-    "NOT_POSITIVE",
     "Belief",
     "Conditioned",
     "Joint",
@@ -33,14 +32,13 @@ __all__ = [
     "mixture_nis",
     "propagate",
     "reweigh",
+    "score",
+    "update",
 ]
 
-NOT_POSITIVE = (
-    "an innovation covariance S = H P H' + R is not positive definite: some measured component has "
-    "neither noise nor uncertainty. Give every measured component a positive variance in R."
-)
-FLOOR = 1e-290  # keeps the moments of a mode of probability zero defined, and touches nothing else
 _LOG_2PI = float(np.log(2.0 * np.pi))
+_ROUNDING = 8.0 * float(np.finfo(np.float64).eps)  # of a row, below which what is left of it is rounding
+FLOOR = 1e-290  # keeps the moments of a mode of probability zero defined, and touches nothing else
 
 
 class Belief(NamedTuple):
@@ -52,16 +50,22 @@ class Belief(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """The joint prediction of state and measurement: x+ = A x + b + e, y = C x + d + f, cov[e; f] = N."""
+    """The joint prediction of state and measurement: x+ = mean + X u, y + Y u, of independent sources u ~ N(0, I)."""
 
     mean: Float[np.ndarray, "*lead p"]  # of x+
     y: Float[np.ndarray, "*lead m"]
-    U: Float[np.ndarray, "*lead p m"]  # cov(x+, y)
-    S: Float[np.ndarray, "*lead m m"]  # cov(y)
-    cov: Float[np.ndarray, "*lead n n"]  # of x, before the step
-    A: Float[np.ndarray, "*_a p n"]
-    C: Float[np.ndarray, "*_c m n"]
-    N: Float[np.ndarray, "*_n pm pm"]
+    X: Float[np.ndarray, "*_x p sources"]
+    Y: Float[np.ndarray, "*_y m sources"]
+
+    @property
+    def U(self) -> Float[np.ndarray, "*lead p m"]:
+        """The covariance of x+ and y, X Y'."""
+        return np.asarray(self.X @ self.Y.swapaxes(-1, -2))
+
+    @property
+    def S(self) -> Float[np.ndarray, "*lead m m"]:
+        """The covariance of y, Y Y'."""
+        return symmetric(self.Y @ self.Y.swapaxes(-1, -2))
 
 
 class Conditioned(NamedTuple):
@@ -138,9 +142,10 @@ def propagate(
     b: Float[np.ndarray, "*_b n"] | None,
     Q: Float[np.ndarray, "*_q n n"],
 ) -> tuple[Float[np.ndarray, "*out n"], Float[np.ndarray, "*out n n"]]:
-    """Return A x + b and A P A' + Q: the move to a later time without a measurement."""
+    """Return A x + b and (A L)(A L)' + Q, P = L L': the move to a later time without a measurement."""
     moved = (A @ mean[..., None])[..., 0]
-    return moved if b is None else moved + b, quadratic_form(A, cov) + Q
+    root = A @ cholesky(cov)
+    return moved if b is None else moved + b, _squares(root) + Q
 
 
 def joint(
@@ -154,18 +159,17 @@ def joint(
 ) -> Joint:
     """Predict state and measurement together.
 
-    x+ = A x + b + e,   y = C x + d + f,   cov[e; f] = N:
-    U = A P C' + N_ef,   S = C P C' + N_ff.
+    x+ = A x + b + e,   y = C x + d + f,   cov[e; f] = N;   P = L L',  N = [B_e; B_f] [B_e; B_f]':
+    X = [A L  B_e],   Y = [C L  B_f].
 
     White measurement noise after propagation is A = I, C = H, N = diag(0, R); coloured noise by differencing has
     all blocks. A need not be square: differencing takes the measured part in after a gap and drops it when known.
     """
-    n = A.shape[-2]
+    p, L, B = A.shape[-2], cholesky(cov), cholesky(N)
     moved = (A @ mean[..., None])[..., 0]
     y = (C @ mean[..., None])[..., 0]
-    U = A @ cov @ C.swapaxes(-1, -2) + N[..., :n, n:]
-    S = quadratic_form(C, cov) + N[..., n:, n:]
-    return Joint(moved if b is None else moved + b, y if d is None else y + d, U, S, cov, A, C, N)
+    sources = _beside(A @ L, B[..., :p, :]), _beside(C @ L, B[..., p:, :])
+    return Joint(moved if b is None else moved + b, y if d is None else y + d, *sources)
 
 
 def measure(
@@ -176,58 +180,141 @@ def measure(
     R: Float[np.ndarray, "*_r m m"],
 ) -> Joint:
     """Return `joint` for white measurement noise: z = H x + d + v, cov v = R."""
-    n, m = mean.shape[-1], R.shape[-1]
-    N = np.zeros((*R.shape[:-2], n + m, n + m))
-    N[..., n:, n:] = R
-    return joint(mean, cov, np.eye(n), None, H, d, N)
+    L, y = cholesky(cov), (H @ mean[..., None])[..., 0]
+    X = np.concatenate([L, np.zeros((*L.shape[:-1], R.shape[-1]))], axis=-1)
+    return Joint(mean, y if d is None else y + d, X, _beside(H @ L, cholesky(R)))
+
+
+def _beside(a: Float[np.ndarray, "*_a r p"], b: Float[np.ndarray, "*_b r q"]) -> Float[np.ndarray, "*both r pq"]:
+    lead = np.broadcast_shapes(a.shape[:-2], b.shape[:-2])
+    return np.concatenate([np.broadcast_to(part, (*lead, *part.shape[-2:])) for part in (a, b)], axis=-1)
 
 
 def condition(
     prediction: Joint,
     z: Float[np.ndarray, "*_z m"],
     seen: Bool[np.ndarray, "*_z m"],
+    *,
+    n_runs: int = 0,
+    row: int | None = None,
 ) -> Conditioned:
-    """Condition the joint prediction on the measurement, in Joseph form.
+    """Condition the joint prediction on the measurement, one component after the other.
 
-    nu = z - y,  K = U S^-1,  x = x+ + K nu,  P = (A - K C) P (A - K C)' + [I -K] N [I -K]'
+    With c the row of Y of the component in hand, nu its innovation, s = c c', for x+ and the components after it:
 
-    A component not seen has its column of U and its nu zero and its row and column of S those of the unit matrix, so
-    it changes nothing and costs no branch.
+        K = X c' / s,   x+ <- x+ + K nu,   X <- X - K c,   d2 <- d2 + nu^2 / s,   in the end P+ = X X'
+
+    Gram-Schmidt on the rows of Y, and what it does to X: the sources of x+ that are left are those orthogonal to what
+    was measured. With K the gain of all components X = [A - K C  I  -K] [L; B] is Joseph's form, a sum of squares, and
+    each s is a pivot of S. No S is formed or inverted: two measurements of one thing, each 10^8 times as precise as
+    its prediction, still leave the second its own information. A component not seen has its row of Y and its nu zero,
+    so it changes nothing and costs no branch.
+
+    Args:
+        prediction: of `joint` or `measure`.
+        z: measurement, with axes of length 1 for the modes.
+        seen: which components were measured, like z.
+        n_runs: number of leading axes that count runs, and
+        row: number of the row: for the message of an error.
 
     Raises:
-        NumericalError: an innovation covariance is not positive definite.
+        NumericalError: a component has neither noise nor uncertainty of its own.
     """
-    mean, y, U, S, P, A, C, N = prediction
-    n, m = mean.shape[-1], z.shape[-1]
-    on = seen.astype(float)
-    nu = np.where(seen, z - y, 0.0)
-    both = on[..., :, None] * on[..., None, :]
-    off = np.eye(m) * (1.0 - on)[..., None]
-    S = S * both + off
-    U = U * on[..., None, :]
-    try:
-        d2, logdet, L_inv = gaussian_terms(nu, S)
-    except np.linalg.LinAlgError as error:
-        raise NumericalError(NOT_POSITIVE) from error
-    K = U @ L_inv.swapaxes(-1, -2) @ L_inv  # columns of components not seen are zero, so C and N need no mask
-    gain = np.concatenate([np.broadcast_to(np.eye(n), (*K.shape[:-1], n)), -K], axis=-1)
-    cov = quadratic_form(A - K @ C, P) + quadratic_form(gain, N)
-    loglik = np.asarray(-0.5 * (d2 + logdet + _LOG_2PI * on.sum(-1)))
-    return Conditioned(mean + (K @ nu[..., None])[..., 0], cov, loglik, d2)
+    mean, y, X, Y = prediction
+    m, lead = z.shape[-1], np.broadcast_shapes(y.shape[:-1], Y.shape[:-2], z.shape[:-1])
+    nu = np.broadcast_to(np.where(seen, z - y, 0.0), (*lead, m))
+    rows = np.broadcast_to(Y * seen[..., None], (*lead, *Y.shape[-2:]))
+    X = np.broadcast_to(X, (*lead, *X.shape[-2:]))
+    swept = _sweep(np.concatenate([rows, X], axis=-2), np.concatenate([nu, np.zeros(X.shape[:-1])], axis=-1), seen)
+    if swept.empty.any():
+        first = [int(i) for i in np.argwhere(swept.empty)[0]]
+        raise NotPositive(place(first[:n_runs], row, first[-1]))
+    loglik = np.asarray(-0.5 * (swept.d2 + swept.logdet + _LOG_2PI * seen.sum(-1)))
+    return Conditioned(mean - swept.left, _squares(swept.rows), loglik, swept.d2)
+
+
+class _Swept(NamedTuple):
+    rows: Float[np.ndarray, "*lead p sources"]  # those after the first m, orthogonal to them
+    left: Float[np.ndarray, "*lead p"]
+    d2: Float[np.ndarray, "*lead"]
+    logdet: Float[np.ndarray, "*lead"]
+    empty: Bool[np.ndarray, "*lead m"]  # nothing but rounding is left of a row that was seen
+
+
+def _sweep(
+    rows: Float[np.ndarray, "*lead mp sources"], left: Float[np.ndarray, "*lead mp"], seen: Bool[np.ndarray, "*_z m"]
+) -> _Swept:
+    """Take the first m rows out of all after them, one after the other, and their share out of `left`."""
+    m = seen.shape[-1]
+    dead = _ROUNDING**2 * np.sum(np.square(rows[..., :m, :]), axis=-1)
+    d2, logdet, empty = np.zeros(left.shape[:-1]), np.zeros(left.shape[:-1]), []
+    for a in range(m):
+        c, nu, on = rows[..., 0, :], left[..., 0], seen[..., a]
+        s = np.sum(np.square(c), axis=-1)
+        empty.append(on & (s <= dead[..., a]))
+        s = np.where(on & (s > 0), s, 1.0)
+        with np.errstate(over="ignore"):
+            d2, logdet = d2 + np.square(nu / np.sqrt(s)), logdet + np.log(s)
+        share = (rows[..., 1:, :] @ c[..., None])[..., 0] / s[..., None]
+        rows, left = rows[..., 1:, :] - share[..., None] * c[..., None, :], left[..., 1:] - share * nu[..., None]
+    return _Swept(rows, left, d2, logdet, np.stack(empty, axis=-1))
+
+
+def _squares(root: Float[np.ndarray, "*lead n q"]) -> Float[np.ndarray, "*lead n n"]:
+    return symmetric(root @ root.swapaxes(-1, -2))
 
 
 def reweigh(
     log_probs: Float[np.ndarray, "*modes"], loglik: Float[np.ndarray, "*modes"], n_chains: int
 ) -> tuple[Float[np.ndarray, "*modes"], Float[np.ndarray, "*lead"]]:
-    """Apply Bayes' rule to the modes, in logs throughout: a 10^4-sigma outlier flattens nothing.
+    """Apply Bayes' rule to the modes, in logs throughout: no outlier flattens them.
 
     Returns:
-        log P(modes | z), normalised, and log f(z) = logsumexp(log P + loglik).
+        log P(modes | z), whose exponentials sum to 1, and log f(z) = log sum exp(log P + loglik).
     """
     axes = tuple(range(log_probs.ndim - n_chains, log_probs.ndim))
-    total = np.asarray(log_probs + loglik)
-    evidence = logsumexp(total, axes)
-    return np.asarray(total - evidence), evidence.reshape(evidence.shape[: evidence.ndim - n_chains])
+    log_probs, evidence = normalised(np.asarray(log_probs + loglik), axes)
+    return log_probs, evidence.reshape(evidence.shape[: evidence.ndim - n_chains])
+
+
+def update(
+    log_probs: Float[np.ndarray, "*modes"],
+    prediction: Joint,
+    z: Float[np.ndarray, "*lead m"],
+    seen: Bool[np.ndarray, "*lead m"],
+    n_chains: int,
+    row: int | None = None,
+) -> tuple[Belief, Float[np.ndarray, "*lead"]]:
+    """Condition every mode on a measurement, and reweigh the modes; returns the belief and log f(z).
+
+    Raises:
+        DataError: the measurement of a run is too far from what every mode predicts.
+        NumericalError: a component has neither noise nor uncertainty, or the prediction has overflowed.
+    """
+    shape = z.shape[:-1] + (1,) * n_chains + z.shape[-1:]
+    done = condition(prediction, z.reshape(shape), seen.reshape(shape), n_runs=z.ndim - 1, row=row)
+    log_probs, log_f = reweigh(log_probs, done.loglik, n_chains)
+    check_evidence(log_f, prediction.y, prediction.Y, z, seen, row)
+    return Belief(log_probs, done.mean, done.cov), log_f
+
+
+def score(
+    log_probs: Float[np.ndarray, "*modes"],
+    prediction: Joint,
+    z: Float[np.ndarray, "*lead m"],
+    seen: Bool[np.ndarray, "*lead m"],
+    n_chains: int,
+) -> Float[np.ndarray, "*lead"]:
+    """Return log f(z), -inf where the distance overflows.
+
+    Raises:
+        NumericalError: a component has neither noise nor uncertainty, or the prediction has overflowed.
+    """
+    shape = z.shape[:-1] + (1,) * n_chains + z.shape[-1:]
+    done = condition(prediction, z.reshape(shape), seen.reshape(shape), n_runs=z.ndim - 1)
+    _, log_f = reweigh(log_probs, done.loglik, n_chains)
+    check_evidence(np.where(log_f == -np.inf, 0.0, log_f), prediction.y, prediction.Y, z, seen)
+    return log_f
 
 
 def collapse(
@@ -260,8 +347,13 @@ def mixture_nis(
 
     nu = z - sum P y,   S = sum P [S + (y - mean y)(y - mean y)'],   d2 = nu' S^-1 nu over the components seen.
     """
-    S = np.broadcast_to(prediction.S, prediction.y.shape + prediction.y.shape[-1:])
-    y_mean, y_cov = collapse(log_probs, prediction.y, S, n_chains)
-    on = seen.astype(float)
-    y_cov = y_cov * on[..., :, None] * on[..., None, :] + np.eye(z.shape[-1]) * (1.0 - on)[..., None]
-    return gaussian_terms(np.where(seen, z - y_mean, 0.0), y_cov)[0]
+    lead = log_probs.shape[: log_probs.ndim - n_chains]
+    (m, sources), n_modes = prediction.Y.shape[-2:], prod(log_probs.shape[len(lead) :])
+    p = np.exp(log_probs).reshape(*lead, n_modes, 1)
+    y = np.broadcast_to(prediction.y, (*log_probs.shape, m)).reshape(*lead, n_modes, m)
+    Y = np.broadcast_to(prediction.Y, (*log_probs.shape, m, sources)).reshape(*lead, n_modes, m, sources)
+    mean = np.sum(p * y, axis=-2)
+    # Every mode is a source of its own, and so is its distance from the mean.
+    roots = np.concatenate([Y, (y - mean[..., None, :])[..., None]], axis=-1) * np.sqrt(p)[..., None]
+    rows = np.moveaxis(roots, -2, -3).reshape(*lead, m, n_modes * (sources + 1))
+    return np.asarray(_sweep(rows * seen[..., None], np.where(seen, z - mean, 0.0), seen).d2)

@@ -134,7 +134,8 @@ class DiffusionSensor:
             R = R * both + np.eye(nu.shape[-1]) * ~seen[..., :, None]
         if R.ndim == 2:
             L_inv = np.linalg.inv(np.linalg.cholesky(R))
-            d2 = np.square(nu @ L_inv.T).sum(-1)
+            with np.errstate(over="ignore"):  # a distance may be infinite
+                d2 = np.square(nu @ L_inv.T).sum(-1)
             logdet = -2.0 * np.log(np.diagonal(L_inv)).sum()
         else:
             d2, logdet, _ = gaussian_terms(nu, np.broadcast_to(R, (*nu.shape, nu.shape[-1])))

@@ -13,7 +13,7 @@ from saltus.filters.estimates import Estimates
 from saltus.filters.grid.bounds import axes_within, reach, start
 from saltus.filters.grid.generator import Axes, Generator, generator
 from saltus.filters.grid.propagate import Propagator, dense, split, uniformised
-from saltus.filters.observation import Observation, innovation_nis, observation
+from saltus.filters.observation import Observation, impossible, innovation_nis, observation
 from saltus.linalg import symmetric
 from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE
 from saltus.shapes import Float
@@ -23,6 +23,7 @@ __all__ = ["GridDensity", "GridFilter"]
 _MOST_MATRICES = 8  # different intervals for which transition matrices are made
 _DEFAULT = {1: 320, 2: 120}
 _ON_EDGE = 0.01  # share of a posterior that the outermost cells may hold
+_NOTHING_TOLD = -1e15  # the greatest log-likelihood of a measurement too far away to tell one cell from another
 _COARSER = 2  # the error is judged against a grid with so many times fewer cells
 
 
@@ -172,13 +173,14 @@ def _steps(given: Observation, axes: Axes) -> Iterator[_Step]:
             [given.sensor.log_likelihood(mode, z[:, None], x, float(dt)) for mode in range(flat.shape[1])], axis=1
         )
         top = log_g.max(axis=(1, 2), keepdims=True)
-        flat = flat * np.exp(log_g - top)
+        flat = flat * np.exp(log_g - np.where(np.isfinite(top), top, 0.0))
         total = flat.sum(axis=(1, 2))
-        if not (total > 0).all():
-            run = int(np.argmin(total))
+        lost = ~(total > 0) | (top[:, 0, 0] < _NOTHING_TOLD)
+        if lost.any():
+            run = int(np.argmax(lost))
+            told = impossible(given.sensor, z[run], [(mode, x) for mode in range(flat.shape[1])], run, k)
             raise DataError(
-                f"row {k}: measurement {z[run]} of run {run} is impossible wherever the grid holds probability.\n"
-                "Check its unit, or give wider bounds."
+                f"{told} is impossible wherever the grid holds probability.\nCheck its unit, or give wider bounds."
             )
         p = (flat / total[:, None, None]).reshape(p.shape)
         _inside(p, axes, k, z)

@@ -118,7 +118,7 @@ class Recursion:
             nothing = np.zeros(len(z))
             points = Points(law.log_probs, self.closing.places(law.mean, law.root), weights)
             return Row(points, density, nothing, nothing, self.closing.taken(), nothing.astype(bool))
-        done = update(self.closing, density, weights, given.sensor, z, dt)
+        done = update(self.closing, density, weights, given.sensor, z, dt, k)
         tally = self.closing.taken()
         failed = done.failed | (tally.unrealisable > 0)
         if self.setting.closure == "hermite" and not self.setting.protected:

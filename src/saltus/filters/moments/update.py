@@ -12,11 +12,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from saltus.errors import DataError
 from saltus.filters.moments.basis import Rule
 from saltus.filters.moments.belief import Points, root_of
 from saltus.filters.moments.closure import Closing, Density
-from saltus.filters.observation import innovation_nis
-from saltus.linalg import symmetric
+from saltus.filters.observation import impossible, innovation_nis
+from saltus.linalg import normalised, symmetric
 from saltus.models import DiffusionSensor
 from saltus.shapes import Float
 
@@ -45,6 +46,7 @@ def update(
     sensor: DiffusionSensor,
     z: _Array,
     dt: float,
+    row: int = 0,
 ) -> Updated:
     """Condition densities on one measurement of every run.
 
@@ -55,12 +57,17 @@ def update(
         sensor: what is measured.
         z: (b, m); NaN is missing.
         dt: interval, s, for increments.
+        row: number of the measurement, for the message of an error.
+
+    Raises:
+        DataError: a measurement is impossible at every node of a mode.
     """
     law = density.law
     y = closing.places(law.mean, law.root)
     joint = np.exp(law.log_probs)[..., None] * weights
     nis = innovation_nis(sensor, z, dt, [(y[:, s], joint[:, s]) for s in range(joint.shape[1])])
     log_g = _log_likelihoods(sensor, z, y, dt)
+    _possible(sensor, z, y, log_g, row)
     top = log_g.max(axis=-1, keepdims=True)
     first = weights * np.exp(log_g - top)
     if closing.name == "hermite" and not closing.protected:
@@ -78,6 +85,17 @@ def update(
     total = weights.sum(axis=-1, keepdims=True)
     points, log_l = _weighed(law.log_probs, y, weights / total, np.log(total[..., 0]) + top[..., 0])
     return Updated(points, log_l, nis, np.zeros(len(z), dtype=bool))
+
+
+def _possible(sensor: DiffusionSensor, z: _Array, y: _Array, log_g: _Array, row: int) -> None:
+    """Refuse a measurement whose distance from every node of a mode overflows."""
+    lost = np.argwhere(~np.isfinite(log_g).any(axis=-1))
+    if len(lost):
+        run, mode = (int(i) for i in lost[0])
+        told = impossible(sensor, z[run], [(mode, y[run, mode])], run, row)
+        raise DataError(
+            f"{told} is impossible wherever mode {mode} may be.\nCheck its unit, or give NaN for an outlier."
+        )
 
 
 def _placed(rule: Rule, y: _Array, w: _Array, root: _Array) -> tuple[_Array, _Array, bool]:
@@ -111,12 +129,9 @@ def _log_likelihoods(sensor: DiffusionSensor, z: _Array, y: _Array, dt: float) -
 
 def _weighed(log_probs: _Array, y: _Array, weights: _Array, log_l: _Array) -> tuple[Points, _Array]:
     """Posterior probabilities of the modes; none falls below 1e-10, from where it could hardly return."""
-    joint = log_probs + log_l
-    top = joint.max(axis=-1, keepdims=True)
-    total = np.log(np.exp(joint - top).sum(axis=-1)) + top[:, 0]
-    posterior = np.maximum(joint - total[:, None], _LOG_FLOOR)
-    posterior -= np.log(np.exp(posterior).sum(axis=-1, keepdims=True))
-    return Points(posterior, y, weights), total
+    posterior, total = normalised(log_probs + log_l, (1,))
+    posterior, _ = normalised(np.maximum(posterior, _LOG_FLOOR), (1,))
+    return Points(posterior, y, weights), total[:, 0]
 
 
 def _raw(log_probs: _Array, y: _Array, w: _Array, top: _Array) -> tuple[Points, _Array, npt.NDArray[np.bool_]]:
