@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from math import prod
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -88,13 +89,19 @@ class Bank:
 
     def state(self) -> dict[str, npt.NDArray[Any]]:
         """Return what `restore` goes on from: the beliefs of all rows, and the free ones in the order of their use."""
-        return {**self.read(np.arange(self._capacity))._asdict(), "free": np.array(self._free, np.int64)}
+        beliefs = self._store.read(np.arange(self._capacity))
+        for part in beliefs:
+            part[~self._used] = 0.0  # what a free row holds is nobody's
+        return {**beliefs._asdict(), "free": np.array(self._free, np.int64)}
 
     def restore(self, state: Mapping[str, npt.NDArray[Any]]) -> None:
         """Hold what `state` gave, of a bank of the same states and chains: the same rows under the same numbers."""
         self._capacity, self._free = len(state["log_probs"]), np.asarray(state["free"]).tolist()
+        self._used, self._mark = np.ones(self._capacity, bool), np.zeros(self._capacity, np.intp)
+        self._used[self._free] = False
         self._store = _make_store(self.n, self.sizes, self._capacity, self.backend)
-        self.write(np.arange(self._capacity), Belief(*(np.asarray(state[name]) for name in Belief._fields)))
+        beliefs = Belief(*(np.asarray(state[name]) for name in Belief._fields))
+        self._store.write(np.arange(self._capacity), self._belief(beliefs, self._capacity))
 
     def take(self, rows: _Rows) -> "Bank":
         """Return a new bank whose rows 0..k-1 are copies of `rows` (repeats allowed: hypotheses, resampling)."""

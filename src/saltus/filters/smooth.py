@@ -197,9 +197,9 @@ def smooth_lag(passed: Passed, lag: int, *, floor: float) -> Smoothed:
         at, ends, message = at[inside], ends[inside], Message(*(part[inside] for part in message))
         out = _output(passed, at, message)
         message, joint = _back(passed, at, message, floor)
-        for place in np.flatnonzero((ends - at == lag) | (ends == n_rows - 1)).tolist():
-            mine = steps.Belief(*(part[place] for part in out))
-            rows[int(at[place])] = mine, [None if pair is None else pair[place] for pair in joint]
+        for window in np.flatnonzero((ends - at == lag) | (ends == n_rows - 1)).tolist():
+            mine = steps.Belief(*(part[window] for part in out))
+            rows[int(at[window])] = mine, [None if pair is None else pair[window] for pair in joint]
     return _joined([rows[k][0] for k in range(n_rows)], [rows[k][1] for k in range(n_rows)])
 
 
