@@ -10,7 +10,8 @@ from scipy.stats import chi2
 from oracles import is_psd
 from saltus.errors import ModelError, NumericalError
 from saltus.filters import steps
-from saltus.filters.linearise import cholesky, linearise, sensor_joint, sensor_update
+from saltus.filters.linearise import linearise, sensor_joint, sensor_update
+from saltus.linalg import cholesky
 from saltus.models import Chain, FunctionSensor, LinearSensor, Observer, PolarSensor, constant_velocity
 
 METHODS = ("extended", "cubature")

@@ -206,10 +206,12 @@ def test_merged_copies(rng, sizes, n, groups, isa, using):
     log_weights = 50.0 * rng.normal(size=c)
     log_weights[1 : groups[0]] = -np.inf
     rows = rng.permutation(40)[: len(groups)]
+    nothing = beliefs(rng, 40, sizes, n)
     found = []
     for backend in ("native", "numpy"):
         with using(isa):
             copies, bank = (Bank(n, sizes, capacity=40, backend=backend) for _ in range(2))
+        bank.add(nothing)
         numbers = copies.add(each)
         copies = copies.take(numbers)
         found.append((*bank.merge(rows, copies, start, log_weights), *bank.read(rows)))

@@ -196,6 +196,8 @@ class Bank:
         Source: theory notes on fusion, sections 4 and 5, with a memoryless chain on each measurement.
         """
         rows = self._distinct(rows)
+        if copies is self or (copies.n, copies.sizes) != (self.n, self.sizes):
+            raise ModelError("copies are rows of another bank of the same n and chains: bank.take(...).")
         copies._in_use(np.arange(len(log_weights)))
         size = np.diff(start)
         if len(start) != len(rows) + 1 or start[0] != 0 or start[-1] != len(log_weights) or (size < 1).any():

@@ -21,17 +21,16 @@ import numpy as np
 
 from saltus.errors import ModelError, NumericalError
 from saltus.filters import steps
-from saltus.linalg import gaussian_terms
+from saltus.linalg import cholesky, gaussian_terms
 from saltus.models import BoundSensor
 from saltus.shapes import Bool, Float
 
-__all__ = ["Affine", "Linearisation", "cholesky", "linearise", "sensor_joint", "sensor_update"]
+__all__ = ["Affine", "Linearisation", "linearise", "sensor_joint", "sensor_update"]
 
 Linearisation: TypeAlias = Literal["extended", "cubature"]
 
 _HALVINGS = 5  # of the way to the posterior before
 _GAIN = 0.01  # nats, that is a seventh of a standard deviation, below which the plain update is kept
-_DEAD = 1e-14  # part of a variance, left by the components before it, that counts as round-off
 
 
 class Affine(NamedTuple):
@@ -149,30 +148,6 @@ def sensor_update(
     return first, done
 
 
-def cholesky(covs: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
-    """Return lower triangular L with L L' = P, for singular P too: columns of components without spread are zero."""
-    scale = np.sqrt(np.diagonal(covs, axis1=-2, axis2=-1))
-    unit = np.where(scale > 0, scale, 1.0)
-    scaled = covs / (unit[..., :, None] * unit[..., None, :])
-    try:
-        L = np.linalg.cholesky(scaled)
-    except np.linalg.LinAlgError:
-        L = _semidefinite(scaled)
-    return np.asarray(unit[..., :, None] * L)
-
-
-def _semidefinite(P: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
-    """Cholesky's columns one by one; a pivot at round-off ends its column."""
-    L = np.zeros_like(P)
-    for j in range(P.shape[-1]):
-        rest = P[..., :, j] - (L[..., :, :j] @ L[..., j, :j, None])[..., 0]
-        pivot = rest[..., j]
-        alive = pivot > _DEAD * P.shape[-1]
-        column = rest / np.sqrt(np.where(alive, pivot, 1.0))[..., None]
-        L[..., j:, j] = np.where(alive[..., None], column[..., j:], 0.0)
-    return L
-
-
 def _regular(L: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
     """L with a one where a column is zero: nothing varies along it, so any value serves in L^-1 times such a column."""
     return np.asarray(L + np.eye(L.shape[-1]) * (np.diagonal(L, axis1=-2, axis2=-1) == 0.0)[..., None])
@@ -257,7 +232,9 @@ def _free_energy(prior: _Prior, prediction: steps.Joint, done: steps.Conditioned
             "an iterated update weighs what is left of a measurement by R^-1, but R is singular. "
             "Give every measured component a positive variance, or use iterations=1."
         ) from error
-    log_ratio = [np.linalg.slogdet(_of_seen(a, seen))[1] for a in (prediction.S, prediction.N[..., n:, n:])]
+    noise = prediction.Y[..., n:]
+    R = noise @ noise.swapaxes(-1, -2)
+    log_ratio = [np.linalg.slogdet(_of_seen(a, seen))[1] for a in (prediction.S, R)]
     distance = np.sum(u * u, axis=-1) + np.sum(spread * spread, axis=(-1, -2))
     return np.asarray(0.5 * (misfit.mean(0) + distance + log_ratio[0] - log_ratio[1]))
 
