@@ -6,13 +6,18 @@ READY := $(VENV)/.ready
 NATIVE := CMakeLists.txt $(wildcard native/*)
 DOCS_READY := $(VENV)/.docs-ready
 
-.PHONY: demo test check format docs wheel bench sanitize clean
+.PHONY: demo test crash check format docs wheel bench sanitize clean
 
 demo: $(READY)
 	$(BIN)/saltus demo -o out/demo
 
 test: $(READY)
 	$(BIN)/python -m pytest -n auto
+
+# Kill runs of the tracker at every call of the file system and at random moments.
+crash: $(READY)
+	$(BIN)/python tests/crashing.py --kills 200
+	$(BIN)/python tests/crashing.py --kills 200 --way in-place
 
 check: $(READY)
 	$(BIN)/ruff format --check .

@@ -175,6 +175,7 @@ def test_the_study_of_the_simulated_scene(tmp_path, monkeypatch):
     assert result.exit_code == 0, result.output
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        ".saltus.json",
         "figure1_errors.png",
         "figure2_p_fault.png",
         "metrics.json",

@@ -231,6 +231,7 @@ def test_configured_noise_is_used_as_it_stands(two, tmp_path):
 def test_the_report_is_written_unless_declined(two, tmp_path):
     folder, files, _, _ = two
     assert {p.name for p in (folder / "out").iterdir()} == {
+        ".saltus.json",
         "tracks.parquet",
         "assignments.parquet",
         "identifications.parquet",

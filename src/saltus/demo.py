@@ -15,7 +15,7 @@ from saltus.evaluate.matching import match_rows
 from saltus.evaluate.reference import each_time_once
 from saltus.evaluate.tables import read_reference, tracks_of
 from saltus.io.asterix_write import write_cat048
-from saltus.io.write import output_directory
+from saltus.io.write import output_directory, write_table, write_text
 from saltus.simulate import Observations, observe
 from saltus.simulate.scene import DURATION, Aircraft, RadarStation, demo_aircraft, demo_plane, demo_radars
 
@@ -28,6 +28,7 @@ _DATE = "2025-06-01"
 _MIDNIGHT = np.datetime64(_DATE).astype("datetime64[s]").astype(np.int64).item()
 _START = 10 * 3600.0  # s after midnight: the scene's time 0
 _FILES = ("radar_a.ast", "radar_b.ast")
+_SCENE = (*_FILES, "sensors.toml", "truth.parquet")  # other commands read these: tracking them again leaves them
 _CUTOFF = 1000.0  # m: no track follows an aircraft from further away
 _SETTLED = 30.0  # s after a manoeuvre, from which flight counts as steady
 
@@ -70,8 +71,8 @@ def run_demo(output: Path, seed: int) -> None:
 
     console = Console(highlight=False)
     console.print(f"Two radars, {len(demo_aircraft())} aircraft, {DURATION / 60:.0f} minutes, seed {seed}.")
-    with progress_bar() as bar, output_directory(output) as folder:
-        simulated = write_demo(folder, seed)
+    with progress_bar() as bar, output_directory(output, "track", kept=_SCENE) as folder:
+        simulated = _write_scene(folder, seed)
         summary, lines = write_tracks(simulated.files, folder, bar, simulated.config)
     show_summary(summary, output, True, lines)
     tracks = pq.read_table(output / "tracks.parquet")
@@ -80,7 +81,7 @@ def run_demo(output: Path, seed: int) -> None:
     console.print(_table(score))
     for line in _summary(score):
         console.print(line, soft_wrap=True)
-    files = ", ".join(sorted(p.name for p in output.iterdir() if p.is_file()))
+    files = ", ".join(sorted(p.name for p in output.iterdir() if p.is_file() and not p.name.startswith(".")))
     console.print(f"Written to {output}: {files}", soft_wrap=True)
 
 
@@ -90,18 +91,23 @@ def write_demo(output: Path, seed: int) -> Simulated:
     Raises:
         DataError: the output cannot be written.
     """
+    with output_directory(output, "scene") as folder:
+        labels = _write_scene(folder, seed).labels
+    return Simulated(tuple(output / name for name in _FILES), output / "sensors.toml", labels)
+
+
+def _write_scene(folder: Path, seed: int) -> Simulated:
     aircraft, plane, stations = demo_aircraft(), demo_plane(), demo_radars()
     trajectories = [a.trajectory for a in aircraft]
     labels = []
-    with output_directory(output) as folder:
-        streams = np.random.default_rng(seed).spawn(len(stations))
-        for name, station, rng in zip(_FILES, stations, streams, strict=True):
-            seen = observe(station.radar, trajectories, plane, 0.0, DURATION, rng)
-            _write_recording(folder / name, station, seen, aircraft)
-            labels.append(seen.target)
-        (folder / "sensors.toml").write_text(_configuration(stations), encoding="utf-8")
-        pq.write_table(_truth(aircraft), folder / "truth.parquet")
-    return Simulated(tuple(output / name for name in _FILES), output / "sensors.toml", tuple(labels))
+    streams = np.random.default_rng(seed).spawn(len(stations))
+    for name, station, rng in zip(_FILES, stations, streams, strict=True):
+        seen = observe(station.radar, trajectories, plane, 0.0, DURATION, rng)
+        _write_recording(folder / name, station, seen, aircraft)
+        labels.append(seen.target)
+    write_text(folder / "sensors.toml", _configuration(stations))
+    write_table(folder / "truth.parquet", _truth(aircraft))
+    return Simulated(tuple(folder / name for name in _FILES), folder / "sensors.toml", tuple(labels))
 
 
 def _write_recording(path: Path, station: RadarStation, seen: Observations, aircraft: Sequence[Aircraft]) -> None:

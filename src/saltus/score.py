@@ -1,6 +1,5 @@
 """`saltus score`: how good the tracks of an output directory are against the truth."""
 
-import json
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -11,7 +10,8 @@ from saltus.errors import DataError
 from saltus.evaluate import Reference, Tracks, target_scores
 from saltus.evaluate.tables import read_reference, read_tracks
 from saltus.geo import ecef_to_geodetic
-from saltus.io.write import output_file
+from saltus.io.publish import settle
+from saltus.io.write import output_file, write_json
 from saltus.text import say
 
 __all__ = ["score_files"]
@@ -37,6 +37,7 @@ def score_files(output: Path, truth: Path, json_path: Path | None = None, cutoff
     Raises:
         DataError: a table or a column is missing, a value cannot be, or the two have no time or place in common.
     """
+    settle(output)
     if not (output / "tracks.parquet").is_file():
         raise DataError(f"{output}: no tracks.parquet in it; OUTPUT is a folder that saltus track wrote.")
     tracks, targets = read_tracks(output / "tracks.parquet"), read_reference(truth)
@@ -44,7 +45,7 @@ def score_files(output: Path, truth: Path, json_path: Path | None = None, cutoff
     figures = target_scores(tracks, targets, cutoff=cutoff)
     if json_path is not None:
         with output_file(json_path) as temporary:
-            temporary.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+            write_json(temporary, figures)
     _show(figures)
     return figures
 

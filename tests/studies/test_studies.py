@@ -25,7 +25,7 @@ def test_a_study_writes_metrics_and_pictures(written):
     figure = metrics["rmse"]["measurement"]["steady"]["x"]
     assert set(figure) == {"value", "standard_error", "low", "high"}
     pictures = sorted(p.name for p in written.iterdir() if p.suffix == ".png")
-    assert len(pictures) == 6 and len(list(written.iterdir())) == 7
+    assert len(pictures) == 6 and len(list(written.glob("[!.]*"))) == 7
     for name in pictures:
         head = (written / name).read_bytes()[:24]
         assert head[:8] == b"\x89PNG\r\n\x1a\n"

@@ -1,6 +1,5 @@
 """`saltus diagnose noise`: correlation time and level of a sensor's errors, a picture and a suggestion."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from saltus.diagnose.figure import draw_noise
 from saltus.diagnose.fit import NoiseFit, Parameter, fit_noise
 from saltus.diagnose.residuals import Phase, Residuals, from_recordings, from_table
 from saltus.errors import DataError
-from saltus.io.write import output_directory
+from saltus.io.write import output_directory, write_json
 from saltus.text import say
 
 __all__ = ["diagnose_noise"]
@@ -67,9 +66,8 @@ def diagnose_noise(
             fits[name] = fit_noise(found.times[there], found.values[there, i], found.labels[there], motion=motion)
         except DataError as error:
             raise DataError(f"{', '.join(map(str, inputs))}: {name}: {error}") from error
-    with output_directory(output) as folder:
-        text = json.dumps({name: _tree(fit) for name, fit in fits.items()}, indent=2, allow_nan=False)
-        (folder / "noise.json").write_text(text + "\n", encoding="utf-8")
+    with output_directory(output, "noise") as folder:
+        write_json(folder / "noise.json", {name: _tree(fit) for name, fit in fits.items()})
         if not motion:
             draw_noise(folder / "noise.png", found, fits)
     _show(found, fits, output)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from saltus.gap.compare import optimality_gap
 from saltus.gap.model_file import load_scenario
-from saltus.io.write import output_file
+from saltus.io.write import output_file, write_text
 from saltus.progress import progress_bar
 from saltus.text import say
 
@@ -43,7 +43,7 @@ def show_gap(
     text = json.dumps({"model": str(path), "seed": seed, **_clean(gap.to_dict())}, indent=2, allow_nan=False)
     if output is not None:
         with output_file(output) as temporary:
-            temporary.write_text(text + "\n", encoding="utf-8")
+            write_text(temporary, text + "\n")
     say(text if as_json else "\n".join(gap.lines()))
 
 

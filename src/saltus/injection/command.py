@@ -1,7 +1,6 @@
 """`saltus study faults`: track a recording as it is and with faults put into it, with and without the chains."""
 
-import json
-import tempfile
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from saltus.evaluate.plots import OWN_RUN, Followed, Motion, downlinked, followe
 from saltus.evaluate.tables import read_reference
 from saltus.injection.figures import RUNS, draw, errors, found, growth
 from saltus.injection.plots import inject
-from saltus.io.write import output_directory
+from saltus.io.write import output_directory, write_json
 from saltus.progress import progress_bar
 from saltus.records import Kind, Recording
 from saltus.run import track_recording
@@ -62,13 +61,13 @@ def study_faults(
     """
     if seed < 0:
         raise ModelError(f"seed must be >= 0, got {seed}.")
-    with output_directory(output) as folder:
+    with output_directory(output, "study") as folder:
         if recordings:
             config = load_config(config_path, date=date, framing=framing)
             recording = io.read(recordings, date=config.date, editions=config.editions, framing=config.framing)
             truth = None if reference is None else downlinked(recording.plots, reference)
         else:
-            recording, config, truth = _scene(seed)
+            recording, config, truth = _scene(folder, seed)
         fault, runs = _track(recording, config, seed)
         truth = truth or from_run(runs["clean_with"])
         metrics = {
@@ -77,17 +76,18 @@ def study_faults(
             "recording": [Path(p).name for p in recordings] or "simulated",
             **_metrics(recording, fault, runs, truth, folder),
         }
-        (folder / "metrics.json").write_text(json.dumps(metrics, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_json(folder / "metrics.json", metrics)
     _show(metrics)
     return metrics
 
 
-def _scene(seed: int) -> tuple[Recording, Config, Motion]:
-    with tempfile.TemporaryDirectory() as name:
-        scene = write_demo(Path(name) / "scene", seed)
-        config = load_config(scene.config)
-        recording = io.read(scene.files, date=config.date, editions=config.editions)
-        truth = read_reference(scene.config.with_name("truth.parquet"))
+def _scene(folder: Path, seed: int) -> tuple[Recording, Config, Motion]:
+    """Simulate in a folder of its own within `folder`, so that a kill leaves nothing elsewhere."""
+    scene = write_demo(folder / "scene", seed)
+    config = load_config(scene.config)
+    recording = io.read(scene.files, date=config.date, editions=config.editions)
+    truth = read_reference(scene.config.with_name("truth.parquet"))
+    shutil.rmtree(folder / "scene")
     files = {path.name: labels for path, labels in zip(scene.files, scene.labels, strict=True)}
     plots = recording.plots
     label = np.full(len(plots), -1, np.int64)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.errors import DataError
-from saltus.io.write import output_file
+from saltus.io.write import blamed, output_file
 
 __all__ = ["write_cat048"]
 
@@ -76,7 +76,7 @@ def write_cat048(
     blocks = _status_blocks(sac, sic, np.asarray(north_marker_times, np.float64), n_sectors)
     breaks = [t for t, _ in blocks]
     blocks += _plot_blocks(sac, sic, time, columns, names, order, breaks)
-    with output_file(path) as temporary:
+    with output_file(path) as temporary, blamed(temporary):
         temporary.write_bytes(b"".join(block for _, block in sorted(blocks, key=lambda b: b[0])))
 
 

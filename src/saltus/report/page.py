@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from saltus.io.write import output_file
+from saltus.io.write import output_file, write_text
 from saltus.records import Plots, System
 from saltus.report.colours import HEIGHT_ENDS, PROBABILITY_ENDS, colour_map
 from saltus.report.data import payload, rows_within, time_span
@@ -94,7 +94,7 @@ def write_report(
         **_tables(updates, assignments, innovations, summary, names),
     )
     with output_file(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        write_text(temporary, page)
 
 
 def _template() -> "jinja2.Template":

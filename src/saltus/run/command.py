@@ -1,6 +1,5 @@
 """`saltus track`: recordings in, tracks, assignments, summary and report out."""
 
-import json
 import re
 import time
 from collections.abc import Iterator, Sequence
@@ -11,13 +10,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from saltus import io
 from saltus.config import Config, SensorConfig, load_config
 from saltus.errors import DataError
 from saltus.geo import Site
-from saltus.io.write import output_directory
+from saltus.io.write import output_directory, write_json, write_table
 from saltus.progress import Progress, progress_bar
 from saltus.records import REASONS, Kind, Plots, Recording, Source
 from saltus.run.identified import (
@@ -75,7 +73,7 @@ def track_files(
         DataError: an input cannot be read, or nothing in it can be tracked.
         ModelError: the configuration is wrong.
     """
-    with progress_bar() as bar, output_directory(output, () if report else (_REPORT,)) as folder:
+    with progress_bar() as bar, output_directory(output, "track") as folder:
         summary, lines = write_tracks(
             inputs, folder, bar, config_path, date_text, identity, time_from, time_to, report, framing
         )
@@ -340,9 +338,8 @@ def _chunks(rows: Sequence[Rows], size: int = 200) -> Iterator[Rows]:
 
 
 def _write(folder: Path, tracks: pa.Table, assigned: pa.Table, whole: Identified, summary: dict[str, object]) -> None:
-    pq.write_table(tracks, folder / "tracks.parquet")
-    pq.write_table(assigned, folder / "assignments.parquet")
-    pq.write_table(identification_table(whole), folder / "identifications.parquet")
-    biases = json.dumps(bias_tables(whole), indent=2) + "\n"
-    (folder / "biases.json").write_text(biases, encoding="utf-8")
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    write_table(folder / "tracks.parquet", tracks)
+    write_table(folder / "assignments.parquet", assigned)
+    write_table(folder / "identifications.parquet", identification_table(whole))
+    write_json(folder / "biases.json", bias_tables(whole))
+    write_json(folder / "summary.json", summary)

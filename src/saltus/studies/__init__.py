@@ -1,12 +1,11 @@
 """Studies: experiments that measure the filters, each one function in a table."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
 from saltus.errors import ModelError
-from saltus.io.write import output_directory
+from saltus.io.write import output_directory, write_json
 from saltus.studies.coloured_report import coloured_study
 from saltus.studies.fusion_report import fusion_study
 from saltus.studies.identification_report import identification_study
@@ -64,7 +63,6 @@ def run_study(
         raise ModelError(f"no study named {name!r}; the studies are: {', '.join(sorted([*STUDIES, *_OF_RECORDINGS]))}.")
     if (runs is not None and runs < 2) or seed < 0:
         raise ModelError(f"need runs >= 2 (intervals come from the runs' spread) and seed >= 0: {runs}, {seed}.")
-    with output_directory(output) as folder:
+    with output_directory(output, "study") as folder:
         metrics = STUDIES[name](folder, runs, seed, progress)
-        text = json.dumps({"study": name, "seed": seed, **metrics}, indent=2, allow_nan=False)
-        (folder / "metrics.json").write_text(text + "\n", encoding="utf-8")
+        write_json(folder / "metrics.json", {"study": name, "seed": seed, **metrics})

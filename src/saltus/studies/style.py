@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from saltus.io.write import blamed
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -63,7 +65,8 @@ def new_figure(height: float, title: str) -> "Iterator[Figure]":
 
 def save(figure: "Figure", path: Path) -> None:
     """Write the figure as PNG, 1200 pixels wide; equal figures give equal bytes."""
-    figure.savefig(path, format="png", metadata={"Software": None})
+    with blamed(path):
+        figure.savefig(path, format="png", metadata={"Software": None})
 
 
 def shade(axes: "Axes", time: npt.ArrayLike, flags: npt.ArrayLike, label: str | None = None) -> None:
