@@ -450,7 +450,7 @@ def leftovers(folder):
 
 
 @pytest.mark.parametrize(
-    "where", ["saltus.run.tracking.place_plots", "saltus.run.command.assignment_table", "saltus.run.command.json.dumps"]
+    "where", ["saltus.run.tracking.place_plots", "saltus.run.command.assignment_table", "saltus.io.write.json.dumps"]
 )
 @pytest.mark.parametrize("older", [False, True])
 def test_ctrl_c_leaves_nothing_half_written(tmp_path, monkeypatch, where, older):
