@@ -164,8 +164,8 @@ def test_shares_of_plots_told(rng):
 def test_the_study_of_the_simulated_scene(tmp_path, monkeypatch):
     whole = command._scene
 
-    def beginning(seed):
-        recording, config, truth = whole(seed)
+    def beginning(folder, seed):
+        recording, config, truth = whole(folder, seed)
         early = recording.plots.time < recording.plots.time.min() + 50.0
         cut = Motion(truth.name, *(column[early] for column in truth[1:]))
         return replace(recording, plots=recording.plots.take(early)), config, cut
