@@ -53,7 +53,7 @@ def output_directory(path: Path | str, kind: str = "results", kept: Collection[s
     try:
         with _named(path, target, stage.path):
             yield stage.path
-        with _named(path, target, stage.path):
+        with _named(path, target):
             publish(stage, target, kind, frozenset(kept))
     finally:
         stage.close()
@@ -96,7 +96,7 @@ def output_file(path: Path | str) -> Iterator[Path]:
             yield temporary
         if not temporary.exists():
             raise DataError(f"{path}: nothing was written.")
-        with _named(path, target, temporary):
+        with _named(path, target):
             os.replace(temporary, target)
     finally:
         stage.close()
