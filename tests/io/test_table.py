@@ -47,6 +47,23 @@ def test_polar_csv(tmp_path):
     assert [c.n_reports for c in got.contents] == [1, 1]
 
 
+def test_a_table_in_which_a_container_of_asterix_could_be_seen_is_a_table(tmp_path):
+    """Bearings between positions in time order; the digits of many read as lengths of blocks."""
+    rng = np.random.default_rng(1)
+    rows = []
+    for i in range(6):
+        p, v = 25e3 * np.array([np.sin(i + 0.3), np.cos(i + 0.3)]), 120 * np.array([np.sin(i + 0.9), np.cos(i + 0.9)])
+        for k in range(400):
+            q = p + v * k
+            r, az = np.hypot(*q), np.degrees(np.arctan2(*q))
+            if k % 4 == i % 4:
+                rows.append(f"{1.7e9 + k + 0.01 * i:.3f},radar,polar,{r + 30 * rng.normal():.2f},{az % 360:.5f}")
+            if k % 2 == 0:
+                rows.append(f"{1.7e9 + k + 0.5:.3f},cam,bearing,,{(az + 0.5 * rng.normal()) % 360:.5f}")
+    got = csv(tmp_path, "\n".join(["time,source,kind,range_m,azimuth_deg", *sorted(rows)]) + "\n")
+    assert len(got.plots) == len(rows)
+
+
 def test_a_source_that_measures_range_turns_round(tmp_path):
     got = csv(tmp_path, "time,range_m,azimuth_deg,source\n1,1000,90,radar\n1,,90,camera\n")
     assert [(s.system.name, s.traits) for s in got.plots.sources] == [

@@ -61,7 +61,7 @@ FORMATS = (
     Format("ASTERIX", (".ast", ".raw", ".asterix"), (), _asterix),
     Format("CSV table", (".csv",), (), _csv),
 )
-_ASTERIX = FORMATS[2]
+_ASTERIX, _CSV = FORMATS[2:]
 
 
 def read(
@@ -118,7 +118,7 @@ def format_of(path: Path, framing: str | None = None) -> Format:
             return entry
     from saltus.io.blocks import looks_like_asterix
 
-    if looks_like_asterix(head):
+    if not (path.suffix.lower() in _CSV.suffixes and _is_text(head)) and looks_like_asterix(head):
         return _ASTERIX
     for entry in FORMATS:
         if path.suffix.lower() in entry.suffixes:
@@ -128,3 +128,8 @@ def format_of(path: Path, framing: str | None = None) -> Format:
         f"{path}: unknown format: it begins with {head[:8].hex(' ')} and not with an ASTERIX block. Known: {known}. "
         "ASTERIX in a recorder's container is recognised by its structure; --framing NAME insists on one."
     )
+
+
+def _is_text(head: bytes) -> bool:
+    """Whether bytes hold no control characters: no block of ASTERIX is without, and some digits make a container."""
+    return not any(byte < 32 and byte not in b"\t\n\r" for byte in head)
