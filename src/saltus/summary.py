@@ -148,7 +148,6 @@ def health_of(sensors: Sensors, tracked: Tracked) -> list[Health]:
     m, confirmed = tracked.measurements, tracked.assignments.confirmed
     rows = join_rows(tracked.rows)
     at = np.flatnonzero((rows.measurement >= 0) & np.isin(rows.track_id, confirmed))
-    at = at[np.isnan(m.bearing[rows.measurement[at]])]  # a bearing says nothing of faults: it repeats the last plot's
     plot = rows.measurement[at]
     found = rows.p_fault[at], rows.fault[at]
     return sensor_health(sensors.names, tracked.assignments.sources, m.source[plot], m.time[plot], *found)

@@ -10,6 +10,7 @@ from tracking_scenes import SITE, flights, measured, observed, polar_noise, run
 
 from saltus.errors import ModelError
 from saltus.geo import Plane
+from saltus.records import Kind
 from saltus.simulate import Leg, Radar, Trajectory, observe
 from saltus.tracks.faults import History, SourceCondition, plot_law, weighty
 from saltus.tracks.health import degraded_intervals, sensor_health
@@ -39,7 +40,7 @@ def test_a_fault_widens_what_it_makes_wrong(rng):
 
     cov = m.cov.copy()
     cov[:, :2, :2] = plane(across**2, along**2)
-    law = plot_law(SETTINGS, polar=True)
+    law = plot_law(SETTINGS, Kind.POLAR)
     found = law.covariances(replace(m, cov=cov), np.arange(7))
     wrong = (
         (np.radians(SETTINGS.outlier_azimuth) * distance) ** 2,
@@ -60,7 +61,7 @@ def test_a_fault_widens_what_it_makes_wrong(rng):
 
 def test_positions_are_wrong_as_a_whole():
     m = measured([0.0], [[1e3, 2e3]], 30.0)
-    law = plot_law(SETTINGS, polar=False)
+    law = plot_law(SETTINGS, Kind.PLANE)
     found = law.covariances(m, np.arange(1))[0, :, :2, :2]
     variances = [900.0, 900.0 + 200.0**2, 16 * 900.0, 16 * 900.0 + 200.0**2]
     np.testing.assert_allclose(found, np.array(variances)[:, None, None] * np.eye(2), rtol=1e-12)
@@ -68,7 +69,7 @@ def test_positions_are_wrong_as_a_whole():
     np.testing.assert_allclose(
         np.exp(law.log_own), [[0.995 * 0.99, 0.995 * 0.01, 0.005 * 0.99, 0.005 * 0.01], [0.0, 0.0, 0.99, 0.01]]
     )
-    alone = plot_law(replace(SETTINGS, degraded_noise=1.0), polar=False)
+    alone = plot_law(replace(SETTINGS, degraded_noise=1.0), Kind.PLANE)
     np.testing.assert_allclose(np.exp(alone.log_own), [[0.99, 0.01]])
 
 
@@ -78,7 +79,7 @@ def test_the_condition_is_that_of_all_sequences(rng, polar):
 
     One of the two was seen a second before and counts as a quarter of a plot.
     """
-    law = plot_law(SETTINGS, polar=polar)
+    law = plot_law(SETTINGS, Kind.POLAR if polar else Kind.PLANE)
     source, times = SourceCondition(law, SETTINGS), [0.0, 7.0, 11.0]
     log_f = rng.normal(-10.0, 3.0, (3, 3, len(law.fault)))
     heard = np.array([1.0, 0.25, 0.0])
@@ -130,7 +131,7 @@ def test_the_condition_is_that_of_all_sequences(rng, polar):
 
 
 def test_a_track_is_heard_once_in_four_seconds():
-    source = SourceCondition(plot_law(SETTINGS, polar=True), SETTINGS)
+    source = SourceCondition(plot_law(SETTINGS, Kind.POLAR), SETTINGS)
     confirmed = np.array([True, True, False])
     first = source.voice(np.array([3, 7, 9]), np.array([10.0, 10.5, 10.0]), confirmed)
     again = source.voice(np.array([7, 9, 3]), np.array([11.5, 20.0, 16.0]), np.array([True, True, True]))
@@ -141,7 +142,7 @@ def test_a_track_is_heard_once_in_four_seconds():
 
 
 def test_tentative_tracks_say_nothing_of_a_source(rng):
-    source = SourceCondition(plot_law(SETTINGS, polar=True), SETTINGS)
+    source = SourceCondition(plot_law(SETTINGS, Kind.POLAR), SETTINGS)
     prior = source.predicted(0.0)
     source.absorb(0.0, prior, rng.normal(size=(4, 12)) * 50.0, np.zeros(4))
     assert len(source.history.time) == 0
@@ -352,7 +353,7 @@ def both(a, b):
 
 
 def test_spells_of_a_degraded_source():
-    law = plot_law(SETTINGS, polar=True)
+    law = plot_law(SETTINGS, Kind.POLAR)
     p = np.zeros((10, 4))
     p[:, 0] = [1.0, 0.6, 0.4, 0.0, 0.3, 0.9, 1.0, 0.1, 0.6, 0.6]
     p[:, 2] = 1.0 - p[:, 0]  # azimuth
@@ -367,7 +368,9 @@ def test_spells_of_a_degraded_source():
 
 
 def test_health_counts_by_source_and_component():
-    sources = [SourceCondition(plot_law(SETTINGS, polar=polar), SETTINGS) for polar in (True, False)]
+    sources = [
+        SourceCondition(plot_law(SETTINGS, Kind.POLAR if polar else Kind.PLANE), SETTINGS) for polar in (True, False)
+    ]
     found = sensor_health(
         ["radar", "ads-b"],
         sources,

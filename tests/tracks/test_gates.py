@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2, ncx2
 from tracking_scenes import measured
 
+from saltus.records import Kind
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate
 from saltus.tracks.kinematics import Start, make_kinematics
@@ -54,7 +55,7 @@ def gated(filters, mean, m, *, probability, identity=True, prior=None, **kwargs)
     kinematics, life, rows = tracks(filters, mean, **kwargs)
     settings = TrackerSettings(gate_probability=probability)
     gate = Gate(settings, filters, np.array([4.0, 4.0]), use_identity=identity)
-    source = SourceCondition(plot_law(settings, polar=bool(np.isfinite(m.ray).all())), settings)
+    source = SourceCondition(plot_law(settings, Kind.POLAR if np.isfinite(m.ray).all() else Kind.PLANE), settings)
     prior = source.predicted(0.0) if prior is None else np.log(prior)
     found = gate(kinematics, life, m, np.arange(len(m)), source, prior)
     row_of = np.full(rows.max() + 1, -1)

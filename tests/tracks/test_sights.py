@@ -8,6 +8,8 @@ from tracking_scenes import fed, tracker_of
 
 from saltus.geo import Plane
 from saltus.records import Kind, Plots, Source, System
+from saltus.tracks.faults import SourceCondition, plot_law
+from saltus.tracks.gates import Gate
 from saltus.tracks.kinematics import Chosen, Start, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Noise, place_plots
@@ -20,6 +22,7 @@ ONE_MODE = FilterSettings(accel_h=(0.1,), sojourn_h=(100.0,), accel_v=(0.01,), s
 SETTINGS = TrackerSettings(
     detection_probability=0.9, clutter_density=1e-6, max_speed=15.0, coast_seconds=8.0, height_prior=(0.0, 10.0)
 )
+NO_FAULT = TrackerSettings(plot_outlier=0.0, degraded_noise=1.0)
 GATE = 15.137  # chi-square, one degree of freedom, 0.9999
 SIGMA = 0.02
 
@@ -49,6 +52,12 @@ def observed(time, source, kind, origin, xy=None, bearing=None, sigma_xy=2.0):
 def bearings(time, origin, bearing):
     n = len(time)
     return observed(np.asarray(time, float), np.ones(n), np.full(n, Kind.BEARING), origin, bearing=np.asarray(bearing))
+
+
+def seen_by(kinematics, life, m, index):
+    source = SourceCondition(plot_law(NO_FAULT, Kind.BEARING), NO_FAULT)
+    gate = Gate(SETTINGS, ONE_MODE, np.ones(2), use_identity=False)
+    return sight(kinematics, life, m, index, gate, source, source.predicted(0.0))
 
 
 def one_track(mean, cov, status=CONFIRMED):
@@ -98,13 +107,13 @@ def test_one_update_is_the_extended_kalman_filter_s(angle, rng):
     K = P @ H.T / S
     expected, expected_cov = x + K[:, 0] * nu, P - K @ H @ P
     m = bearings([dt], [origin], [z + PLANE.factors([origin])[0][0]])
-    seen = sight(kinematics, life, m, np.array([0]), GATE)
-    kinematics.absorb(seen.pairs.track, seen.copies, Chosen.sure(seen.copy, seen.plan, seen.cov))
+    seen = seen_by(kinematics, life, m, np.array([0]))
+    kinematics.absorb(seen.pairs.track, seen.copies, Chosen.sure(seen.copy, seen.plan, seen.covs[:, 0]))
     moments = kinematics.moments(seen.pairs.track)
     np.testing.assert_allclose(moments.mean[0, :4], expected, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(moments.cov[0, :4, :4], expected_cov, rtol=1e-4, atol=1e-5)
     # Density of the bearing, per radian.
-    assert seen.log_f[0] == pytest.approx(-0.5 * (nu**2 / S + np.log(2 * np.pi * S)), abs=1e-4)
+    assert seen.score()[0, 0] == pytest.approx(-0.5 * (nu**2 / S + np.log(2 * np.pi * S)), abs=1e-4)
 
 
 def test_inflation_widens_the_update_and_no_gate():
@@ -113,17 +122,17 @@ def test_inflation_widens_the_update_and_no_gate():
     cov = np.diag([9.0, 0.01, 9.0, 0.01, 1.0, 1.0])
     m = bearings([1e-3], origin, [np.pi / 2 + 0.05])
 
-    def after(seen_by):
+    def after(seen):
         kinematics, life = one_track(mean, cov)
-        seen = sight(kinematics, life, seen_by, np.array([0]), GATE)
-        kinematics.absorb(seen.pairs.track, seen.copies, Chosen.sure(seen.copy, seen.plan, seen.cov))
-        return seen, kinematics.moments(seen.pairs.track)
+        found = seen_by(kinematics, life, seen, np.array([0]))
+        kinematics.absorb(found.pairs.track, found.copies, Chosen.sure(found.copy, found.plan, found.covs[:, 0]))
+        return found, kinematics.moments(found.pairs.track)
 
     inflated, moments = after(replace(m, inflation=np.array([9.0])))
     _, coarse = after(replace(m, sigma_bearing=np.array([3.0 * SIGMA])))
     np.testing.assert_allclose(moments.mean, coarse.mean, atol=1e-6)
     np.testing.assert_allclose(moments.cov, coarse.cov, atol=1e-6)
-    assert inflated.log_f[0] == after(m)[0].log_f[0]
+    assert inflated.d2[0] == after(m)[0].d2[0]
     far = bearings([1e-3], origin, [np.pi / 2 + 0.12])
     assert len(after(replace(far, inflation=np.array([9.0])))[0].copy) == 0
     assert len(after(replace(far, sigma_bearing=np.array([3.0 * SIGMA])))[0].copy) == 1
@@ -138,7 +147,7 @@ def test_gates_of_bearings():
 
     def pairs(bearing, status=CONFIRMED):
         kinematics, life = one_track(mean, cov, status)
-        return len(sight(kinematics, life, bearings([1e-3], origin, [bearing]), np.array([0]), GATE).pairs.track)
+        return len(seen_by(kinematics, life, bearings([1e-3], origin, [bearing]), np.array([0])).pairs.track)
 
     assert pairs(np.pi) == pairs(np.pi - 0.9 * limit) == pairs(0.9 * limit - np.pi) == 1
     assert pairs(np.pi - 1.1 * limit) == pairs(0.0) == 0

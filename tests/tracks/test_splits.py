@@ -12,9 +12,9 @@ from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.identities import identify
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.membership import Segments
-from saltus.tracks.settings import SystemsSettings
+from saltus.tracks.settings import FilterSettings, SystemsSettings
 from saltus.tracks.splits import second_echoes, split_evidence
-from saltus.tracks.systems import Registered
+from saltus.tracks.systems import Registered, pairing_settings
 
 
 def radar(*ways, sigma=3.0, seed=0, polar=True):
@@ -58,7 +58,7 @@ def test_echoes_that_go_together_are_one_object_and_neighbours_are_not():
         parked(525.0, -400.0),  # beside it
         taxiing(-700.0, 1500.0, 12.0),
     )
-    found, _ = identify([system], [Registered("radar", "", None)], SystemsSettings())
+    found, _ = identify([system], [Registered("radar", "", None)], SystemsSettings(), FilterSettings())
     pairs = set(zip(found.episodes.a.tolist(), found.episodes.b.tolist(), strict=True))
     assert pairs == {(0, 1)}
     assert found.episodes.probability.min() > 0.999
@@ -66,9 +66,9 @@ def test_echoes_that_go_together_are_one_object_and_neighbours_are_not():
 
 def test_only_radars_have_second_echoes():
     ways = taxiing(-800.0, 300.0), taxiing(-780.0, 310.0)
-    assert split_evidence(radar(*ways), SystemsSettings()) is not None
-    assert split_evidence(radar(*ways, polar=False), SystemsSettings()) is None
-    assert split_evidence(radar(parked(0.0, 300.0), parked(20.0, 300.0)), SystemsSettings()) is None
+    assert split_evidence(radar(*ways), SystemsSettings(), FilterSettings()) is not None
+    assert split_evidence(radar(*ways, polar=False), SystemsSettings(), FilterSettings()) is None
+    assert split_evidence(radar(parked(0.0, 300.0), parked(20.0, 300.0)), SystemsSettings(), FilterSettings()) is None
 
 
 def test_the_later_of_two_tracks_of_one_system_is_the_echo():
@@ -129,3 +129,14 @@ def test_a_second_echo_belongs_to_the_track_and_does_not_move_it(aerodrome):
     north = (np.array(rows["latitude"]) - 48.0) * 111_190.0  # the echo lies 12 m further north
     assert abs(north.mean() - 1500.0) < 3.0
     assert np.abs(north - 1500.0).max() < 9.0
+
+
+def test_objects_move_as_the_filters_say():
+    """Levels of acceleration as configured; a turn and the hardest of them are one manoeuvre."""
+    system = radar(parked(0.0, 300.0))
+    found = pairing_settings([system], SystemsSettings(), FilterSettings(), 0.0)
+    assert (found.accel, found.sojourn, found.accel_time) == ((0.15, 3.0), (150.0, 25.0), 4.0)
+    boats = FilterSettings(accel_h=(0.01, 0.1, 0.5), sojourn_h=(60.0, 30.0, 20.0), turn_rate=(), accel_time=0.0)
+    found = pairing_settings([system], SystemsSettings(), boats, 0.0)
+    assert (found.accel, found.sojourn, found.accel_time) == ((0.01, 0.1, 0.5), (60.0, 30.0, 20.0), 4.0)
+    assert pairing_settings([system], SystemsSettings(), FilterSettings(accel_time=2.0), 0.0).accel_time == 2.0

@@ -18,7 +18,6 @@ from saltus.tracks.identities import identify
 from saltus.tracks.local import LocalSystem, Party, foreign_systems, group_sources, local_system
 from saltus.tracks.measurements import make_plane
 from saltus.tracks.membership import Segments, segments
-from saltus.tracks.registration import RegistrationSettings
 from saltus.tracks.rows import join_rows
 from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.system_tracks import Part, track_systems
@@ -73,7 +72,7 @@ def track_plots(
     reference = _reference(config.systems.reference, parties, sensors, [system.name for system in local])
     if len(local) == 1:
         return tracked[0], _single(local[0])
-    whole = _identified(local, replace(config.systems, reference=reference), config.registration)
+    whole = _identified(local, replace(config.systems, reference=reference), config)
     return _joined(tracked, parties, whole, plane, sensors, config, use_identity=use_identity), whole
 
 
@@ -122,9 +121,9 @@ def _reference(told: str, parties: Sequence[Party], sensors: Sensors, systems: S
     return of_sensor[told]
 
 
-def _identified(local: Sequence[LocalSystem], settings: SystemsSettings, expected: RegistrationSettings) -> Identified:
-    registered, how = register_all(local, settings, expected)
-    decisions, evidence = identify(registered, how, settings)
+def _identified(local: Sequence[LocalSystem], settings: SystemsSettings, config: Config) -> Identified:
+    registered, how = register_all(local, settings, config.registration)
+    decisions, evidence = identify(registered, how, settings, config.filter)
     begin, end = [], []
     for system in local:
         tracks = system.view.tracks

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.linalg import logsumexp
+from saltus.records import Kind
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import TrackerSettings
 
@@ -36,13 +37,13 @@ _ROUGH = 0.005  # of positions that transmitters tell err as under a degraded so
 class PlotLaw:
     """The h covariances that a plot of one source may have; the first is a good plot's of a source that is well."""
 
-    components: tuple[str, ...]  # what may go wrong: azimuth and range, or the position
+    components: tuple[str, ...]  # what may go wrong: azimuth and range, azimuth, or the position
     degraded: npt.NDArray[np.bool_]  # (q, components): what each condition of the source degrades; the first nothing
     condition: _Index  # (h,)
     fault: npt.NDArray[np.int8]  # (h,): 0 none, else 1 + the component
     log_own: _Array  # (q, h): log probability of the hypothesis given the condition of the source
     growth: float  # of the variance, in a degraded component
-    outlier: _Array  # (components,): standard deviation of a fault, rad and m
+    outlier: _Array  # (components,): standard deviation of a fault, rad or m
 
     def covariances(self, m: Measurements, index: _Index, which: _Index | None = None) -> _Array:
         """Return covariances of plots under the hypotheses `which` (all by default), (k, h, 3, 3).
@@ -62,6 +63,16 @@ class PlotLaw:
         cov[..., :2, :2] += np.einsum("kha,kaij->khij", extra, basis)
         return cov
 
+    def angular(self, sigma: _Array, which: _Index | None = None) -> _Array:
+        """Return variances of bearings (k,) of standard deviation `sigma` under hypotheses as `covariances`, (k, h).
+
+        Of a source that measures positions, too, a faulty bearing errs like a good one.
+        """
+        h = np.arange(len(self.fault)) if which is None else which
+        growth = np.where(self.degraded[self.condition[h], 0], self.growth, 1.0)
+        wrong = np.where(self.fault[h] == 1, self.outlier[0], 0.0) if self.components[0] == "azimuth" else 0.0
+        return np.asarray(growth * sigma[:, None] ** 2 + np.square(wrong))
+
     def faulty(self, p: _Array) -> tuple[_Array, npt.NDArray[np.int8]]:
         """Return the probability that each plot is wrong, and its likeliest fault (1 + component), 0 if none can be.
 
@@ -75,7 +86,7 @@ class PlotLaw:
 
     def _basis(self, m: Measurements, index: _Index, R: _Array) -> tuple[_Array, _Array, _Array]:
         """Directions B (k, a, 2, 2), variances in them (k, a), deviations of faults (k, a)."""
-        if len(self.components) == 1:
+        if "range" not in self.components:
             each = np.ones((len(index), 1))
             return each[..., None, None] * np.eye(2), 0.5 * np.trace(R, axis1=1, axis2=2)[:, None], each * self.outlier
         ray = m.ray[index]
@@ -107,19 +118,26 @@ def weighty(p: _Array) -> tuple[_Index, _Index, _Index]:
     return each, which, np.append(0, np.cumsum(keep.sum(axis=1)))
 
 
-def plot_law(settings: TrackerSettings, *, polar: bool) -> PlotLaw:
-    """Return what the settings say of the plots of a source, whether it measures range and azimuth or not."""
-    components = ("azimuth", "range") if polar else ("position",)
+def plot_law(settings: TrackerSettings, kind: int) -> PlotLaw:
+    """Return what the settings say of the reports of a source.
+
+    Args:
+        settings: how often, and by how much reports err.
+        kind: what it measures: range and azimuth (`Kind.POLAR`), azimuth alone (`Kind.BEARING`), or positions.
+    """
+    azimuth, far = np.radians(settings.outlier_azimuth), settings.outlier_range
+    outlier = {
+        Kind.POLAR: {"azimuth": azimuth, "range": far},
+        Kind.BEARING: {"azimuth": azimuth},
+    }.get(kind, {"position": settings.outlier_xy})
+    components, p = tuple(outlier), settings.plot_outlier
     conditions = list(product((False, True), repeat=len(components)))
-    faults, p = range(1 + len(components)), settings.plot_outlier
     if settings.degraded_noise == 1.0:
         conditions = conditions[:1]
-    if p == 0.0:
-        faults = range(1)
+    faults = range(1 + len(components)) if p > 0.0 else range(1)
     pairs = np.array(list(product(range(len(conditions)), faults)))
-    rough = 0.0 if polar or len(conditions) == 1 else _ROUGH  # a radar measures all targets by the same means
+    rough = _ROUGH if len(conditions) > 1 and "position" in outlier else 0.0  # a radar measures all by the same means
     prior = np.array([1.0 - p * (len(faults) - 1), *([p] * (len(faults) - 1))])
-    outlier = [np.radians(settings.outlier_azimuth), settings.outlier_range] if polar else [settings.outlier_xy]
     return PlotLaw(
         components,
         np.array(conditions),
@@ -127,7 +145,7 @@ def plot_law(settings: TrackerSettings, *, polar: bool) -> PlotLaw:
         pairs[:, 1].astype(np.int8),
         _log_given(np.array(conditions)[pairs[:, 0]], np.array(conditions), rough=rough) + np.log(prior)[pairs[:, 1]],
         settings.degraded_noise**2,
-        np.array(outlier),
+        np.array(list(outlier.values())),
     )
 
 

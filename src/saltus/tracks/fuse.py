@@ -1,195 +1,183 @@
-"""States of system tracks from the measurements of all their local tracks: every lane of one batch filter a track."""
+"""System tracks' states: the tracker's own step, with the reports that local tracks hand on in place of association."""
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from saltus.filters import imm_filter
-from saltus.shapes import Float, Int
-from saltus.tracks.intervals import Intervals
-from saltus.tracks.kinematics import Channel, Moments, make_kinematics
+from saltus.tracks.faults import PlotLaw, SourceCondition
+from saltus.tracks.gates import Gate
+from saltus.tracks.kinematics import Start, make_kinematics
+from saltus.tracks.lifecycle import CONFIRMED, NO_CODE, TENTATIVE, Birth, Lifecycle
+from saltus.tracks.measurements import Measurements
+from saltus.tracks.publish import Told, coast, updated_rows
+from saltus.tracks.rows import Rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.sights import sighted
+from saltus.tracks.step import absorb, judge
 
-__all__ = ["Fused", "LaneRows", "fuse"]
+__all__ = ["Candidates", "Fusion"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
-
-_CELLS = 60_000  # rows of a batch, padding included
-_HEIGHT_ERROR = 5000.0  # m: standard deviation of a wrong height
+_Mask = npt.NDArray[np.bool_]
 
 
-class LaneRows(NamedTuple):
-    """The rows of all lanes, sorted by lane, then by time; a row without a measurement is a coasted one."""
+class Candidates(NamedTuple):
+    """Reports that local tracks hand on to system tracks, in time order; one array element each."""
 
-    lane: Int[np.ndarray, " n"]  # 0..L-1, every lane has a row
-    time: Float[np.ndarray, " n"]  # s
-    position: Float[np.ndarray, "n 3"]  # x, y, altitude, m; NaN where not measured
-    cov: Float[np.ndarray, "n 3 3"]  # of a good plot
-    faulty: Float[np.ndarray, "n f 3 3"]  # of a plot with each fault
+    number: _Index  # measurement
+    track: _Index  # system track
+    sure: _Mask  # whether a local track of it is confirmed by then
+    begins: _Mask  # whether a track may begin here, from the state below
+    mean: _Array  # (n, 6): of the local track after the report
+    cov: _Array  # (n, 6, 6)
+    shift: _Array  # (n, 2): what the track's frame moves by beforehand, m; 0 mostly
+    turn: _Array  # (n,): and turns by, rad
+    extra: _Array  # (n, 2, 2): covariance of the position beyond the sensor's, m^2
 
-
-class Fused(NamedTuple):
-    """What is known after each row."""
-
-    moments: Moments
-    centre: Float[np.ndarray, "n 2"]  # predicted position
-    gate_cov: Float[np.ndarray, "n 2 2"]  # covariance of the innovation of a good plot
-    p_fault: Float[np.ndarray, "n f"]  # probability of each fault of the plot; NaN without one
-
-
-class _Batch(NamedTuple):
-    """Some lanes, padded: place (lane, step) of each of their rows but the first, and those rows."""
-
-    lanes: _Index
-    shape: tuple[int, int]
-    at: tuple[_Index, _Index]
-    row: _Index
+    def take(self, index: _Index) -> "Candidates":
+        """Return those selected."""
+        return Candidates._make(column[index] for column in self)
 
 
-def fuse(rows: LaneRows, start: Moments, filters: FilterSettings, settings: TrackerSettings) -> Fused:
-    """Filter lanes that begin at their first row with a known state.
+class Fusion:
+    """States of system tracks, fed with slices of candidates.
 
-    The modes are the product of the manoeuvres and of what a plot may be: good, or faulty in one of f ways, drawn anew
-    for each plot. A coasted row is one without measurement.
-
-    Args:
-        rows: measurements of each lane in exact time order.
-        start: state at the first row of each lane, that row's measurement included, (L, ...).
-        filters: manoeuvres.
-        settings: probabilities of faults.
+    Each report is weighed, absorbed and published as in `Tracker`, by the same functions under the same settings; only
+    whose it is was found before, by the trackers of single systems. The condition of every source is filtered from the
+    system tracks: what contradicts the other sources' reports of the same objects is told from what contradicts the
+    past of one source alone.
     """
-    n, first = len(rows.lane), np.flatnonzero(np.diff(rows.lane, prepend=-1))
-    mean, cov = np.zeros((n, 6)), np.zeros((n, 6, 6))
-    manoeuvre = {"horizontal": np.zeros(n), "vertical": np.zeros(n)}
-    p_fault = np.full((n, rows.faulty.shape[1]), np.nan)
-    centre, gate_cov = rows.position[:, :2].copy(), rows.cov[:, :2, :2].copy()
-    begun = {"horizontal": start.p_manoeuvre_h, "vertical": start.p_manoeuvre_v}
-    for channel in make_kinematics(filters).channels:
-        s = channel.states
-        mean[first[:, None], s] = start.mean[:, s]
-        cov[first[:, None, None], s[:, None], s] = start.cov[:, s[:, None], s]
-        for chain in channel.chains:
-            manoeuvre[chain.name][first] = begun[chain.name]
-        for batch in _batches(first, np.diff(np.append(first, n))):
-            _filter(channel, rows, batch, first, begun, settings, (mean, cov, manoeuvre, p_fault, centre, gate_cov))
-    return Fused(Moments(mean, cov, manoeuvre["horizontal"], manoeuvre["vertical"]), centre, gate_cov, p_fault)
+
+    def __init__(
+        self,
+        settings: TrackerSettings,
+        filters: FilterSettings,
+        laws: Sequence[PlotLaw],
+        periods: Sequence[float],
+        *,
+        use_identity: bool,
+    ) -> None:
+        """Begin without tracks.
+
+        Args:
+            settings: faults, coasting, gates of heights.
+            filters: manoeuvres.
+            laws: what may be wrong with reports of each source.
+            periods: s without a report after which a target counts as missed, of each source.
+            use_identity: whether tracks take over addresses and codes.
+        """
+        self._kinematics, self._life = make_kinematics(filters), Lifecycle(settings)
+        self._periods, self._use_identity = np.asarray(periods, float), use_identity
+        self._gate = Gate(settings, filters, self._periods, use_identity=use_identity)
+        self.conditions = [SourceCondition(law, settings) for law in laws]
+        self._row: dict[int, int] = {}  # of each system track alive
+
+    def feed(self, m: Measurements, candidates: Candidates) -> list[Rows]:
+        """Take one slice; return what is published.
+
+        Args:
+            m: all measurements.
+            candidates: of the slice.
+        """
+        now, known = float(m.time[candidates.number[0]]), float(m.time[candidates.number[-1]])
+        out = self._housekeep(now)
+        for turn in _turns(candidates.track):
+            part = candidates.take(turn)
+            new = np.array([track not in self._row for track in part.track.tolist()])
+            out += self._begin(m, part.take(np.flatnonzero(new & part.begins)), known)
+            rest = part.take(np.flatnonzero(~new))
+            moved = np.flatnonzero(rest.shift.any(axis=1) | (rest.turn != 0.0))
+            if len(moved):
+                self._kinematics.move(self._rows(rest.take(moved)), rest.shift[moved], rest.turn[moved])
+            bearing, source = np.isfinite(m.bearing[rest.number]), m.source[rest.number]
+            for s in np.unique(source).tolist():
+                for sights in (False, True):
+                    own = np.flatnonzero((source == s) & (bearing == sights))
+                    if len(own):
+                        out += self._step(m, rest.take(own), s, known, sights=sights)
+        return out
+
+    def _rows(self, candidates: Candidates) -> _Index:
+        return np.array([self._row[track] for track in candidates.track.tolist()], np.intp)
+
+    def _housekeep(self, now: float) -> list[Rows]:
+        """Publish what coasts; forget what has been silent for too long: should it come back, it begins anew."""
+        life = self._life
+        out = coast(self._kinematics, life, now)
+        ended = life.overdue(now)
+        if len(ended):
+            self._kinematics.remove(ended)
+            life.end(ended)
+            for track in life.id[ended].tolist():
+                del self._row[track]
+        return out
+
+    def _begin(self, m: Measurements, new: Candidates, known: float) -> list[Rows]:
+        """Begin tracks in the state of a local one."""
+        if not len(new.track):
+            return []
+        life, n = self._life, len(new.track)
+        rows = self._kinematics.add(Start(new.mean, new.cov))
+        self._row |= dict(zip(new.track.tolist(), rows.tolist(), strict=True))
+        periods = self._periods[m.source[new.number]]
+        life.begin(rows, Birth(m.time[new.number], periods, new.number, new.mean, new.cov))
+        life.id[rows] = new.track
+        life.has_altitude[rows] = np.isfinite(m.position[new.number, 2])
+        self._note(m, rows, new)
+        cov = m.cov[new.number, :2, :2] + new.extra
+        nothing, none = np.full(n, np.nan), np.zeros(n, np.int8)
+        return self._publish(m, rows, new, Told(new.mean[:, :3:2], cov, nothing, nothing, none, np.nan), known)
+
+    def _step(self, m: Measurements, given: Candidates, s: int, known: float, *, sights: bool) -> list[Rows]:
+        """Update tracks by reports of one source, no track twice."""
+        life, source = self._life, self.conditions[s]
+        rows, time = self._rows(given), float(m.time[given.number].max())
+        if sights:
+            gated = sighted(self._kinematics, life, m, rows, given.number, source)
+            given = given.take(gated.pairs.plot)
+            rows = gated.pairs.track
+        else:
+            extra = np.zeros((len(rows), 3, 3))
+            extra[:, :2, :2] = given.extra
+            gated = self._gate.given(self._kinematics, life, m, rows, given.number, source, extra)
+        plots = given.number
+        voice = source.voice(life.id[rows], m.time[plots], life.status[rows] == CONFIRMED)
+        judged = judge(source, time, source.predicted(time), gated.score(), voice)
+        absorb(self._kinematics, rows, gated, np.arange(len(rows)), judged)
+        if sights:
+            life.sighted(rows, m.time[plots])
+        else:
+            life.hit(rows, m.time[plots], self._periods[m.source[plots]], plots)
+            life.has_altitude[rows] |= gated.height_used
+            life.p_fault[rows] = judged.wrong
+        self._note(m, rows, given)
+        d2 = np.where((judged.wrong > 0.5) | source.degraded | sights, np.nan, gated.d2)
+        told = Told(gated.centre, gated.gate_cov, d2, judged.wrong, judged.fault, source.p_degraded)
+        return self._publish(m, rows, given, told, known)
+
+    def _note(self, m: Measurements, rows: _Index, given: Candidates) -> None:
+        """Take over status and codes."""
+        life, plots = self._life, given.number
+        life.status[rows] = np.where(given.sure, CONFIRMED, TENTATIVE)
+        life.source[rows] = m.source[plots]
+        if self._use_identity:
+            life.icao24[rows] = np.where(m.icao24[plots] != NO_CODE, m.icao24[plots], life.icao24[rows])
+            life.mode3a[rows] = np.where(m.mode3a[plots] != NO_CODE, m.mode3a[plots], life.mode3a[rows])
+            life.callsign[rows] = np.where(m.callsign[plots] != "", m.callsign[plots], life.callsign[rows])
+
+    def _publish(self, m: Measurements, rows: _Index, given: Candidates, told: Told, known: float) -> list[Rows]:
+        life, moments = self._life, self._kinematics.moments(rows)
+        life.mean[rows], life.cov[rows] = moments.mean, moments.cov
+        return [updated_rows(life, rows, moments, m, given.number, told, known)._replace(measurement=given.number)]
 
 
-def _batches(first: _Index, length: _Index) -> list[_Batch]:
-    """Group lanes of like length, so that little is padded; lanes of one row need no filter."""
-    out = []
-    order = np.argsort(length, kind="stable")
-    order = order[length[order] > 1]
-    k = 0
-    while k < len(order):
-        stop = k + 1
-        while stop < len(order) and (stop + 1 - k) * (length[order[stop]] - 1) <= _CELLS:
-            if length[order[stop]] > 1.5 * length[order[k]] + 16:
-                break
-            stop += 1
-        lanes = order[k:stop]
-        steps = length[lanes] - 1
-        lane = np.repeat(np.arange(len(lanes)), steps)
-        step = np.arange(len(lane)) - np.repeat(np.cumsum(steps) - steps, steps)
-        out.append(_Batch(lanes, (len(lanes), int(steps.max())), (lane, step), first[lanes][lane] + 1 + step))
-        k = stop
-    return out
-
-
-def _filter(
-    channel: Channel,
-    rows: LaneRows,
-    batch: _Batch,
-    first: _Index,
-    begun: dict[str, _Array],
-    settings: TrackerSettings,
-    out: tuple[_Array, _Array, dict[str, _Array], _Array, _Array, _Array],
-) -> None:
-    """Run one channel over a batch of lanes and write what it finds into the columns of all rows."""
-    mean, cov, manoeuvre, p_fault, centre, gate_cov = out
-    axes, s, row, n_chains = channel.axes, channel.states, batch.row, len(channel.chains)
-    horizontal = bool(0 in axes)
-    z = np.full((*batch.shape, len(axes)), np.nan)
-    z[batch.at] = rows.position[row][:, axes]
-    dt = np.zeros(batch.shape)
-    dt[batch.at] = rows.time[row] - rows.time[row - 1]
-    good = rows.cov[row][:, axes[:, None], axes]
-    if horizontal:
-        faulty, p = rows.faulty[row][..., axes[:, None], axes], settings.plot_outlier
-    else:
-        faulty, p = good[:, None] + _HEIGHT_ERROR**2, settings.altitude_outlier
-    kinds = 1 + faulty.shape[1]
-    R = np.broadcast_to(np.eye(len(axes)), (*batch.shape, kinds, len(axes), len(axes))).copy()
-    R[batch.at] = np.concatenate([good[:, None], faulty], axis=1)
-    law = np.array([1.0 - p, *([p / (kinds - 1)] * (kinds - 1))])
-    (over,) = Intervals([(channel.motion, channel.chains)]).at(dt.ravel())
-    F, Q = (a.reshape((*batch.shape, *a.shape[1:-2], 1, *a.shape[-2:])) for a in (over.F, over.Q))
-    H = np.zeros((len(axes), 2 * len(axes)))
-    H[np.arange(len(axes)), 2 * np.arange(len(axes))] = 1.0
-    trans = [
-        np.ones((*batch.shape, 1, 1)) if t is None else t.reshape((*batch.shape, *t.shape[1:])) for t in over.trans
-    ]
-    ones = (1,) * n_chains
-    found = imm_filter(
-        z,
-        F=F,
-        Q=Q,
-        H=H.reshape((*ones, 1, *H.shape)),
-        R=R.reshape((*batch.shape, *ones, *R.shape[2:])),
-        trans=[*trans, np.broadcast_to(law, (kinds, kinds))],
-        mean0=mean[first[batch.lanes]][:, s].reshape((-1, *ones, 1, len(s))),
-        cov0=cov[first[batch.lanes]][:, s[:, None], s].reshape((-1, *ones, 1, len(s), len(s))),
-        probs0=_begun(channel, begun, batch.lanes, law),
-    )
-    mean[row[:, None], s] = found.mean[batch.at]
-    cov[row[:, None, None], s[:, None], s] = found.cov[batch.at]
-    probs = found.probs[batch.at]
-    for c, chain in enumerate(channel.chains):
-        others = tuple(1 + i for i in range(n_chains + 1) if i != c)
-        manoeuvre[chain.name][row] = 1.0 - probs.sum(axis=others)[:, 0]
-    if horizontal:
-        seen = np.isfinite(rows.position[row, 0])
-        p_fault[row] = np.where(seen[:, None], probs.sum(axis=tuple(range(1, 1 + n_chains)))[:, 1:], np.nan)
-        before = _begun(channel, begun, batch.lanes, law).sum(axis=-1)[:, None]
-        before = np.concatenate([before, found.probs.sum(axis=-1)[:, :-1]], axis=1)[batch.at]
-        ahead = _ahead(before, [t[batch.at] for t in trans])
-        x, P = mean[row - 1][:, s], cov[row - 1][:, s[:, None], s]
-        x, P = _predicted(x, P, F[batch.at][..., 0, :, :], Q[batch.at][..., 0, :, :], ahead)
-        centre[row], gate_cov[row] = x[:, 0:3:2], P[:, 0:3:2, 0:3:2] + np.where(seen[:, None, None], good[:, :2, :2], 0)
-
-
-def _begun(channel: Channel, begun: dict[str, _Array], lanes: _Index, law: _Array) -> _Array:
-    """Law of the modes at the start: what the local tracker thought of manoeuvres, the others as they last."""
-    probs = np.ones((len(lanes), *(1 for _ in channel.chains), 1))
-    for c, chain in enumerate(channel.chains):
-        share = np.array(chain.law)
-        own = np.zeros((len(lanes), len(share)))
-        p = np.clip(begun[chain.name][lanes], 0.0, 1.0) if len(share) > 1 else np.zeros(len(lanes))
-        own[:, 0] = 1.0 - p
-        own[:, 1:] = p[:, None] * share[1:] / max(float(share[1:].sum()), 1e-300)
-        probs = probs * own.reshape((len(lanes), *(-1 if i == c else 1 for i in range(len(channel.chains))), 1))
-    return np.asarray(probs * law)
-
-
-def _ahead(probs: _Array, trans: list[_Array]) -> _Array:
-    """Law of the modes one interval later, (k, M1, ..., MC)."""
-    for c, step in enumerate(trans):
-        probs = np.moveaxis(np.einsum("k...i,kij->k...j", np.moveaxis(probs, 1 + c, -1), step), -1, 1 + c)
-    return probs
-
-
-def _predicted(mean: _Array, cov: _Array, F: _Array, Q: _Array, probs: _Array) -> tuple[_Array, _Array]:
-    """Mean and covariance of the prediction, every mode from the same state: what a gate is drawn from.
-
-    x = sum_j p_j F_j x0,   P = sum_j p_j [F_j P0 F_j' + Q_j + (F_j x0 - x)(F_j x0 - x)']
-    """
-    modes = tuple(range(1, probs.ndim))
-    lift = (len(mean), *(1 for _ in modes))
-    weight = probs[..., None]
-    each = (F @ mean.reshape((*lift, -1, 1)))[..., 0]
-    x = np.sum(weight * each, axis=modes)
-    away = each - x.reshape((*lift, -1))
-    spread = F @ cov.reshape((*lift, *cov.shape[1:])) @ F.swapaxes(-1, -2) + Q + away[..., :, None] * away[..., None, :]
-    return x, np.sum(weight[..., None] * spread, axis=modes)
+def _turns(track: _Index) -> Iterator[_Index]:
+    """Divide candidates so that no track has two at a time, its earlier ones first."""
+    order = np.argsort(track, kind="stable")
+    turn = np.empty(len(track), np.intp)
+    turn[order] = np.arange(len(track)) - np.searchsorted(track[order], track[order])
+    for k in range(int(turn.max(initial=-1)) + 1):
+        yield np.flatnonzero(turn == k)

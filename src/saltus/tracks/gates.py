@@ -13,7 +13,7 @@ from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
-__all__ = ["Gate", "Gated"]
+__all__ = ["Ahead", "Gate", "Gated", "distances", "predict"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -25,17 +25,34 @@ _LATEST = -2.0  # s: how far a plot may lie before its track's last update
 
 
 class Gated(NamedTuple):
-    """Pairs inside their gates, with a copy of each pair's track moved to the plot's time."""
+    """Pairs of tracks and reports, with a copy of each pair's track moved to the report's time."""
 
     pairs: Pairs  # rows of the bank, positions in the slice
     plan: Plan  # the measurement of each pair, its height removed where it fell outside
-    covs: _Array  # (P, h, 3, 3): its covariance under every hypothesis of its source
-    centre: _Array  # (P, 2), predicted measurement
+    covs: _Array  # (P, h, m, m): its covariance under every hypothesis of its source
+    log_scale: _Array  # (P,): what makes a density of `plan` one of the report's own units
+    centre: _Array  # (P, 2), predicted position
     gate_cov: _Array  # (P, 2, 2), innovation covariance of the most agile mode: the gate
     d2: _Array  # (P,), horizontal squared Mahalanobis distance to the mixture's prediction
     height_used: npt.NDArray[np.bool_]  # (P,)
     copies: Kinematics
     copy: _Index  # (P,): row of each pair among the copies
+
+    def score(self) -> _Array:
+        """Return log densities of the reports under every hypothesis, (P, h)."""
+        return self.log_scale[:, None] + self.copies.score(self.copy, self.plan, self.covs)
+
+
+class Ahead(NamedTuple):
+    """Tracks moved to the times of reports of theirs."""
+
+    copies: Kinematics
+    offset: _Array  # (P,) s, <= 0: how far a report lies before its track's time
+    late: _Array  # (P, 3, 3): what the error of its time stamp adds to a report's covariance
+    extra: _Array  # (P, 3, 3): what else does, whatever is wrong with the report
+    nu: _Array  # (P, 3): innovation of the most agile mode
+    S: _Array  # (P, 3, 3): its covariance
+    centre: _Array  # (P, 2): predicted position
 
 
 class Gate:
@@ -53,6 +70,7 @@ class Gate:
         self.horizontal = _chi2_quantile(settings.gate_probability, 2)
         self.height = _chi2_quantile(settings.gate_probability, 1)
         self.fault = _chi2_quantile(_FAULT_GATE, 2)
+        self.fault_bearing = _chi2_quantile(_FAULT_GATE, 1)
         self._growth = settings.degraded_noise**2
         self._accel, self._accel_time = max(filters.accel_h), filters.accel_time
         self._turn = float(np.radians(max(filters.turn_rate, default=0.0)))
@@ -79,33 +97,59 @@ class Gate:
         """
         near = self._near(life, m, index, source, prior)
         plot = index[near.plot]
-        dt = m.time[plot] - life.time[near.track]
-        offset = np.minimum(dt, 0.0)  # a plot of another source may come a little late
-        copies = kinematics.predicted(near.track, np.maximum(dt, 0.0))
-        every = np.arange(len(dt))
-        late = m.stamped(plot, life.mean[near.track][:, _VELOCITY[:2]])
-        z, R = m.position[plot], m.cov[plot] + late
-        y, S = _measured(*copies.widest(every), offset, R)
-        d2_gate, d2_height = _distances(z - y, S)
+        ahead = predict(kinematics, life, m, near.track, plot, np.zeros((len(plot), 3, 3)))
+        d2, _ = distances(ahead.nu, ahead.S)
         trusted = (life.status[near.track] == CONFIRMED) | self._same_address(near, life, m, index)
-        faulty = self._faulty(d2_gate, trusted, z - y, S - R + late, m, plot, source, prior)
-        inside = np.flatnonzero((d2_gate <= self.horizontal) | faulty)
-        mixture = copies.moments(inside)
-        y_mixture, S_mixture = _measured(mixture.mean, mixture.cov, offset[inside], R[inside])
-        z, plot = z[inside], plot[inside]
-        d2, _ = _distances(z - y_mixture, S_mixture)
-        height_used = np.isfinite(z[:, 2]) & (d2_height[inside] <= self.height)
-        z[~height_used, 2] = np.nan
-        covs = (source.law.covariances(m, plot) + late[inside, None]) * m.inflation[plot, None, None, None]
+        inside = np.flatnonzero((d2 <= self.horizontal) | self._faulty(d2, trusted, ahead, m, plot, source, prior))
+        return self._measured(ahead, near, plot, inside, m, source)
+
+    def given(
+        self,
+        kinematics: Kinematics,
+        life: Lifecycle,
+        m: Measurements,
+        rows: _Index,
+        plots: _Index,
+        source: SourceCondition,
+        extra: _Array,
+    ) -> Gated:
+        """Measure tracks by plots that are known to be theirs; a height outside its gate is left out all the same.
+
+        Args:
+            kinematics: the filters of all tracks.
+            life: their lifecycle.
+            m: all measurements.
+            rows: of tracks, (P,).
+            plots: the one of each, of one source.
+            source: the condition of that source.
+            extra: covariances that plots have beyond those of `m`, (P, 3, 3).
+        """
+        every = np.arange(len(rows))
+        ahead = predict(kinematics, life, m, rows, plots, extra)
+        return self._measured(ahead, Pairs(rows, every), plots, every, m, source)
+
+    def _measured(
+        self, ahead: Ahead, pairs: Pairs, plot: _Index, inside: _Index, m: Measurements, source: SourceCondition
+    ) -> Gated:
+        """What is left of pairs inside their gates."""
+        plot, offset = plot[inside], ahead.offset[inside]
+        mixture = ahead.copies.moments(inside)
+        position, late, extra = m.position[plot].copy(), ahead.late[inside], ahead.extra[inside]
+        y, S = _innovation(mixture.mean, mixture.cov, offset, m.cov[plot] + late + extra)
+        d2, _ = distances(position - y, S)
+        _, d2_height = distances(ahead.nu[inside], ahead.S[inside])
+        height_used = np.isfinite(position[:, 2]) & (d2_height <= self.height)
+        position[~height_used, 2] = np.nan
         return Gated(
-            Pairs(near.track[inside], near.plot[inside]),
-            Plan.of_positions(z, offset[inside]),
-            covs,
-            y[inside, :2],
-            S[inside, :2, :2],
+            Pairs(pairs.track[inside], pairs.plot[inside]),
+            Plan.of_positions(position, offset),
+            (source.law.covariances(m, plot) + late[:, None]) * m.inflation[plot, None, None, None] + extra[:, None],
+            np.zeros(len(inside)),
+            ahead.centre[inside],
+            ahead.S[inside, :2, :2],
             d2,
             height_used,
-            copies,
+            ahead.copies,
             inside,
         )
 
@@ -127,8 +171,7 @@ class Gate:
         self,
         d2: _Array,
         trusted: npt.NDArray[np.bool_],
-        nu: _Array,
-        S: _Array,
+        ahead: Ahead,
         m: Measurements,
         plot: _Index,
         source: SourceCondition,
@@ -143,9 +186,10 @@ class Gate:
         at = np.flatnonzero((d2 > self.horizontal) & (trusted | lasting))
         if len(live) == 1 or not len(at):
             return out
-        wide = S[at][:, None] + source.law.covariances(m, plot[at], live)
+        predicted = ahead.S[at] - m.cov[plot[at]]
+        wide = predicted[:, None] + source.law.covariances(m, plot[at], live)
         k, h = wide.shape[:2]
-        d2_wide = _distances(np.repeat(nu[at], h, axis=0), wide.reshape(-1, 3, 3))[0].reshape(k, h)
+        d2_wide = distances(np.repeat(ahead.nu[at], h, axis=0), wide.reshape(-1, 3, 3))[0].reshape(k, h)
         own = source.law.fault[live] > 0
         out[at] = ((d2_wide <= np.where(own, self.fault, self.horizontal)) & (trusted[at, None] | ~own)).any(axis=1)
         return out
@@ -234,7 +278,28 @@ def _span(time: _Array) -> tuple[float, float]:
     return 0.5 * float(time[0] + time[-1]), 0.5 * float(time[-1] - time[0])
 
 
-def _measured(mean: _Array, P: _Array, offset: _Array, R: _Array) -> tuple[_Array, _Array]:
+def predict(
+    kinematics: Kinematics, life: Lifecycle, m: Measurements, track: _Index, plot: _Index, extra: _Array
+) -> Ahead:
+    """Move copies of tracks to the times of plots, and say what the most agile mode thinks of these.
+
+    Args:
+        kinematics: the filters of all tracks.
+        life: their lifecycle.
+        m: all measurements.
+        track: rows, (P,), repeats allowed.
+        plot: the one to be compared with each.
+        extra: covariances that plots have beyond those of `m` and of their time stamps, (P, 3, 3).
+    """
+    dt = m.time[plot] - life.time[track]
+    offset = np.minimum(dt, 0.0)  # a plot of another source may come a little late
+    copies = kinematics.predicted(track, np.maximum(dt, 0.0))
+    late = m.stamped(plot, life.mean[track][:, _VELOCITY[:2]])
+    y, S = _innovation(*copies.widest(np.arange(len(dt))), offset, m.cov[plot] + late + extra)
+    return Ahead(copies, offset, late, extra, m.position[plot] - y, S, y[:, :2])
+
+
+def _innovation(mean: _Array, P: _Array, offset: _Array, R: _Array) -> tuple[_Array, _Array]:
     """Return the measurement predicted `offset` seconds from the rows' time, and its innovation covariance."""
     t = offset[:, None, None]
     pp, pv, vv = (
@@ -246,7 +311,7 @@ def _measured(mean: _Array, P: _Array, offset: _Array, R: _Array) -> tuple[_Arra
     return y, pp + t * (pv + pv.swapaxes(-1, -2)) + t * t * vv + R
 
 
-def _distances(nu: _Array, S: _Array) -> tuple[_Array, _Array]:
+def distances(nu: _Array, S: _Array) -> tuple[_Array, _Array]:
     """Return the squared Mahalanobis distances of plane position and of height."""
     det = S[:, 0, 0] * S[:, 1, 1] - S[:, 0, 1] ** 2
     a, b = nu[:, 0], nu[:, 1]

@@ -21,7 +21,7 @@ from saltus.identify import (
 from saltus.linalg import logsumexp
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.local import LocalSystem
-from saltus.tracks.settings import SystemsSettings
+from saltus.tracks.settings import FilterSettings, SystemsSettings
 from saltus.tracks.splits import split_evidence
 from saltus.tracks.systems import Registered, lasting_difference, pairing_settings, short_difference
 
@@ -38,7 +38,7 @@ _LARGE = 10.0  # of the lasting difference: so far it may reach
 
 
 def identify(
-    systems: Sequence[LocalSystem], how: Sequence[Registered], settings: SystemsSettings
+    systems: Sequence[LocalSystem], how: Sequence[Registered], settings: SystemsSettings, filters: FilterSettings
 ) -> tuple[Decisions, Evidence]:
     """Decide over time which local tracks are one object.
 
@@ -51,13 +51,14 @@ def identify(
         systems: registered.
         how: how they were.
         settings: when to declare.
+        filters: how objects move, as tracks do.
     """
     first = np.cumsum([0, *(len(s.ids) for s in systems)])
     parts = []
     for i in range(len(systems)):
         for j in range(i + 1, len(systems)):
             lasting = lasting_difference(how[i], how[j])
-            pairing = pairing_settings([systems[i], systems[j]], settings, lasting)
+            pairing = pairing_settings([systems[i], systems[j]], settings, filters, lasting)
             own = short_difference(how[i], how[j])
             a, b = _counted(systems[i], systems[j], settings, own)
             if not len(a.time) or not len(b.time):
@@ -67,7 +68,7 @@ def identify(
             found = _mixed(a, b, pairing, reach, max(settings.window, _ROWS * max(_interval(a), _interval(b))))
             gain = _identity(systems[i], systems[j], found.pairs)
             parts.append((found._replace(llr=found.llr + gain[found.pair]), int(first[i]), int(first[j])))
-        split = split_evidence(systems[i], settings)
+        split = split_evidence(systems[i], settings, filters)
         if split is not None:
             parts.append((split, int(first[i]), int(first[i])))
     evidence = join_evidence(parts)

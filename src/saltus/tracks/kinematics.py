@@ -170,6 +170,20 @@ class Kinematics:
         for channel in self.channels:
             channel.bank.write(rows, channel.belief(start))
 
+    def move(self, rows: _Rows, shift: _Array, turn: _Array) -> None:
+        """Move the frame of rows: positions by `shift` (k, 2), m; velocities turn anticlockwise by `turn` (k,), rad."""
+        for channel in self.channels:
+            if 0 not in channel.axes:
+                continue
+            belief = channel.bank.read(rows)
+            lift = (len(rows), *(1 for _ in channel.bank.sizes))
+            (c, s), (x, y) = ((a.reshape(lift), b.reshape(lift)) for a, b in ((np.cos(turn), np.sin(turn)), shift.T))
+            means = belief.means.copy()
+            means[..., 0], means[..., 2] = means[..., 0] + x, means[..., 2] + y
+            vx, vy = belief.means[..., 1], belief.means[..., 3]
+            means[..., 1], means[..., 3] = c * vx - s * vy, s * vx + c * vy
+            channel.bank.write(rows, belief._replace(means=means))
+
     def remove(self, rows: _Rows) -> None:
         """Free rows."""
         for channel in self.channels:

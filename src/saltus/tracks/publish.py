@@ -5,12 +5,12 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.kinematics import Moments
+from saltus.tracks.kinematics import Kinematics, Moments
 from saltus.tracks.lifecycle import COASTED, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.rows import Rows
 
-__all__ = ["Told", "coasted_rows", "updated_rows"]
+__all__ = ["Told", "coast", "updated_rows"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -22,6 +22,7 @@ class Told(NamedTuple):
     centre: _Array  # (k, 2): centre of the gate
     gate_cov: _Array  # (k, 2, 2): innovation covariance
     d2: _Array  # (k,): of the innovation, NaN where it says nothing of the noise
+    p_fault: _Array  # (k,): probability that it is faulty, NaN where nothing told
     fault: npt.NDArray[np.int8]  # (k,): likeliest fault, 1 + component, 0 where none can be
     p_degraded: float  # of the source, NaN where unknown
 
@@ -56,14 +57,25 @@ def updated_rows(
         centre=told.centre,
         gate_cov=told.gate_cov,
         d2=told.d2,
-        p_fault=life.p_fault[rows],
+        p_fault=told.p_fault,
         fault=told.fault.astype(np.int8),
         p_degraded=np.full(n, told.p_degraded),
         time_known=np.full(n, known),
     )
 
 
-def coasted_rows(life: Lifecycle, rows: _Index, moments: Moments, time: _Array, known: float) -> Rows:
+def coast(kinematics: Kinematics, life: Lifecycle, now: float) -> list[Rows]:
+    """Return rows of confirmed tracks where a plot was expected by `now` and none came."""
+    out = []
+    rows, expected = life.to_coast(now)
+    while len(rows):
+        ahead = kinematics.predicted(rows, expected - life.time[rows])
+        out.append(_coasted(life, rows, ahead.moments(np.arange(len(rows))), expected, now))
+        rows, expected = life.to_coast(now)
+    return out
+
+
+def _coasted(life: Lifecycle, rows: _Index, moments: Moments, time: _Array, known: float) -> Rows:
     """Return the rows of tracks that missed the plot expected at `time`, as known at `known`."""
     n = len(rows)
     return Rows(

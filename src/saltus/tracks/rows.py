@@ -37,6 +37,11 @@ class Rows(NamedTuple):
     p_degraded: _Array  # probability that the source of the update is degraded; NaN where coasted
     time_known: _Array  # time of the last report that the row rests on, s
 
+    def take(self, at: npt.NDArray[np.integer] | npt.NDArray[np.bool_]) -> "Rows":
+        """Return the rows selected."""
+        moments = Moments(*(column[at] for column in self.moments))
+        return Rows(moments=moments, **{n: getattr(self, n)[at] for n in Rows._fields if n != "moments"})
+
 
 def join_rows(parts: Sequence[Rows]) -> Rows:
     """Join rows published at different times; no part gives no rows."""

@@ -6,11 +6,13 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.tracks.associate import Pairs
+from saltus.tracks.faults import SourceCondition
+from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.kinematics import Kinematics, Plan
 from saltus.tracks.lifecycle import CONFIRMED, Lifecycle
 from saltus.tracks.measurements import Measurements
 
-__all__ = ["Sighted", "sight"]
+__all__ = ["sight", "sighted"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -18,20 +20,26 @@ _Index = npt.NDArray[np.intp]
 _LATEST = -2.0  # s: how far a bearing may lie before its track's last update
 
 
-class Sighted(NamedTuple):
-    """Pairs of confirmed tracks and bearings inside their gates, with a copy of each pair's track at that time."""
+class _Line(NamedTuple):
+    """Tracks moved to the times of bearings, and where these lead past the most agile mode."""
 
-    pairs: Pairs  # rows of the bank, positions in the slice
-    plan: Plan  # one component: the distance across the line of sight
-    cov: _Array  # (P, 3, 3)
-    centre: _Array  # (P, 2), predicted position, m
-    centre_cov: _Array  # (P, 2, 2), of the predicted position, m^2
-    log_f: _Array  # (P,): log density of the bearing, per rad
     copies: Kinematics
-    copy: _Index  # (P,): row of each pair among the copies
+    offset: _Array  # (P,) s, <= 0
+    across: _Array  # (P, 2): unit vector across the line of sight
+    rho: _Array  # (P,): distance along it, m
+    aside: _Array  # (P,): distance across it, m
+    variance: _Array  # (P,): of that, of the track alone, m^2
 
 
-def sight(kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Index, gate: float) -> Sighted:
+def sight(
+    kinematics: Kinematics,
+    life: Lifecycle,
+    m: Measurements,
+    index: _Index,
+    gate: Gate,
+    source: SourceCondition,
+    prior: _Array,
+) -> Gated:
     """Pair confirmed tracks with the bearings `index` of a slice.
 
     With o the observer, u the unit vector along the bearing beta and c across it, the sensor's equation
@@ -39,55 +47,81 @@ def sight(kinematics: Kinematics, life: Lifecycle, m: Measurements, index: _Inde
 
         0 = c'(x - o) + rho v,   innovation -c'(y - o),  variance c'P c + (rho sigma)^2.
 
-    It is exact in the angle (no wrapping is met); the filter takes the variance times the source's inflation.
+    It is exact in the angle (no wrapping is met); sigma is that of every hypothesis of the source, and the filter takes
+    the variance times the source's inflation.
 
     Args:
         kinematics: the filters of all tracks.
         life: their lifecycle.
         m: measurements.
         index: bearings of one source in one slice.
-        gate: quantile of the chi-square law of one degree of freedom.
+        gate: the gates.
+        source: the condition of that source, and what may be wrong with its bearings.
+        prior: log probabilities of the conditions.
 
     Source: linearisation of the bearing at the predicted position, the extended Kalman filter's.
     """
-    near = _candidates(life, m, index, gate)
+    live = source.live(prior)
+    near = _candidates(life, m, index, gate, source, live)
     plot = index[near.plot]
-    dt = m.time[plot] - life.time[near.track]
+    line = _line(kinematics, life, m, near.track, plot)
+    limit = np.where(source.law.fault[live] > 0, gate.fault_bearing, gate.height)
+    S = line.variance[:, None] + line.rho[:, None] ** 2 * source.law.angular(m.sigma_bearing[plot], live)
+    inside = np.flatnonzero((line.rho > 0.0) & (line.aside[:, None] ** 2 <= limit * S).any(axis=1))
+    return _gated(line, Pairs(near.track[inside], near.plot[inside]), inside, m, plot[inside], source)
+
+
+def sighted(
+    kinematics: Kinematics, life: Lifecycle, m: Measurements, rows: _Index, plots: _Index, source: SourceCondition
+) -> Gated:
+    """Measure tracks by bearings that are known to be theirs: rows and plots (P,), of one source.
+
+    Bearings that lead away from their track are left out.
+    """
+    line = _line(kinematics, life, m, rows, plots)
+    ahead = np.flatnonzero(line.rho > 0.0)
+    return _gated(line, Pairs(rows[ahead], ahead), ahead, m, plots[ahead], source)
+
+
+def _line(kinematics: Kinematics, life: Lifecycle, m: Measurements, track: _Index, plot: _Index) -> _Line:
+    dt = m.time[plot] - life.time[track]
     offset = np.minimum(dt, 0.0)
-    copies = kinematics.predicted(near.track, np.maximum(dt, 0.0))
-    every = np.arange(len(plot))
+    copies = kinematics.predicted(track, np.maximum(dt, 0.0))
     u, c = _directions(m.bearing[plot])
-    mean, cov = copies.widest(every)
-    rho, aside = _along(mean, offset, m.origin[plot], u), _along(mean, offset, m.origin[plot], c)
+    mean, cov = copies.widest(np.arange(len(plot)))
     P = cov[:, :3:2, :3:2]  # the offset of a late bearing is too short to matter here
-    sigma = rho * m.sigma_bearing[plot]
-    S = np.einsum("ki,kij,kj->k", c, P, c) + sigma**2
-    inside = np.flatnonzero((rho > 0.0) & (aside**2 <= gate * S))
-    c, rho, sigma, offset = c[inside], rho[inside], sigma[inside], offset[inside]
-    mixture = copies.moments(inside)
+    rho, aside = _along(mean, offset, m.origin[plot], u), _along(mean, offset, m.origin[plot], c)
+    return _Line(copies, offset, c, rho, aside, np.einsum("ki,kij,kj->k", c, P, c))
+
+
+def _gated(line: _Line, pairs: Pairs, inside: _Index, m: Measurements, plot: _Index, source: SourceCondition) -> Gated:
+    c, rho, offset = line.across[inside], line.rho[inside], line.offset[inside]
+    mixture = line.copies.moments(inside)
     P = mixture.cov[:, :3:2, :3:2]
-    S = np.einsum("ki,kij,kj->k", c, P, c) + sigma**2
-    d2 = _along(mixture.mean, offset, m.origin[plot[inside]], c) ** 2 / S
-    sigma = sigma * np.sqrt(m.inflation[plot[inside]])
+    variance = rho[:, None] ** 2 * source.law.angular(m.sigma_bearing[plot])
+    d2 = _along(mixture.mean, offset, m.origin[plot], c) ** 2 / (np.einsum("ki,kij,kj->k", c, P, c) + variance[:, 0])
     z, C = np.full((len(inside), 3), np.nan), np.zeros((len(inside), 3, 6))
-    z[:, 0] = (c * m.origin[plot[inside]]).sum(axis=-1)
+    z[:, 0] = (c * m.origin[plot]).sum(axis=-1)
     C[:, 0, :3:2], C[:, 0, 1:4:2] = c, offset[:, None] * c
-    R = np.tile(np.eye(3), (len(inside), 1, 1))
-    R[:, 0, 0] = sigma**2
-    centre = mixture.mean[:, :3:2] + offset[:, None] * mixture.mean[:, 1:4:2]
-    return Sighted(
-        Pairs(near.track[inside], near.plot[inside]),
+    covs = np.tile(np.eye(3), (*variance.shape, 1, 1))
+    covs[..., 0, 0] = variance * m.inflation[plot, None]
+    return Gated(
+        pairs,
         Plan(z, C),
-        R,
-        centre,
+        covs,
+        np.log(rho),
+        mixture.mean[:, :3:2] + offset[:, None] * mixture.mean[:, 1:4:2],
         P,
-        np.log(rho) - 0.5 * (d2 + np.log(2.0 * np.pi * S)),
-        copies,
+        d2,
+        np.zeros(len(inside), bool),
+        line.copies,
         inside,
     )
 
 
-def _candidates(life: Lifecycle, m: Measurements, index: _Index, gate: float) -> Pairs:
+def _candidates(
+    life: Lifecycle, m: Measurements, index: _Index, gate: Gate, source: SourceCondition, live: _Index
+) -> Pairs:
     """Pair every confirmed track with every bearing it could have, judged from its last state alone."""
     rows = life.rows()
     rows = rows[life.status[rows] == CONFIRMED]
@@ -98,7 +132,8 @@ def _candidates(life: Lifecycle, m: Measurements, index: _Index, gate: float) ->
     cov = life.cov[track]
     speed = np.hypot(life.mean[track, 1], life.mean[track, 3])
     spread = np.sqrt(cov[:, 0, 0] + cov[:, 2, 2] + dt**2 * (cov[:, 1, 1] + cov[:, 3, 3]))
-    reach = np.sqrt(gate) * (2.0 * spread + np.abs(rho) * m.sigma_bearing[index[plot]]) + speed * np.abs(dt)
+    sigma = np.sqrt(source.law.angular(m.sigma_bearing[index], live).max(axis=1))[plot]
+    reach = np.sqrt(gate.height) * (2.0 * spread + np.abs(rho) * sigma) + speed * np.abs(dt)
     keep = (dt > _LATEST) & (np.abs(aside) <= reach)
     return Pairs(track[keep], plot[keep])
 

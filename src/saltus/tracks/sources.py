@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from saltus.records import Kind
 from saltus.tracks.background import Background, flat, learn_background
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.slices import slice_width
@@ -18,7 +19,7 @@ class SourceSetup:
 
     period: float  # update period, s
     wait: float  # s between two reports of a target that it leaves waiting longest, before one counts as missed
-    polar: bool  # whether it measures range and azimuth
+    kind: int  # what it measures: `Kind.POLAR`, `Kind.PLANE` (any position) or `Kind.BEARING`
     background: Background
 
 
@@ -43,9 +44,17 @@ def learn_setup(
     """
     sources = []
     for s, (period, wait) in enumerate(zip(periods, periods if waits is None else waits, strict=True)):
-        own = (m.source == s) & np.isfinite(m.position[:, 0])
-        polar = bool(own.any() and np.isfinite(m.ray[own, 0]).all())
+        kind = _kind(m, s)
+        polar = kind == Kind.POLAR
         background = flat(density) if density is not None else learn_background(m, s, period, polar=polar)
-        sources.append(SourceSetup(float(period), float(wait), polar, background))
+        sources.append(SourceSetup(float(period), float(wait), kind, background))
     used = [sources[s] for s in np.unique(m.source).tolist()]
-    return TrackerSetup(tuple(sources), slice_width([s.period for s in used], [s.polar for s in used]))
+    return TrackerSetup(tuple(sources), slice_width([s.period for s in used], [s.kind == Kind.POLAR for s in used]))
+
+
+def _kind(m: Measurements, source: int) -> int:
+    own = m.source == source
+    placed = own & np.isfinite(m.position[:, 0])
+    if not placed.any():
+        return Kind.BEARING if own.any() else Kind.PLANE
+    return Kind.POLAR if np.isfinite(m.ray[placed, 0]).all() else Kind.PLANE

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from saltus.identify import Evidence, LocalTracks, pair_evidence
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.membership import Segments
-from saltus.tracks.settings import SystemsSettings
+from saltus.tracks.settings import FilterSettings, SystemsSettings
 from saltus.tracks.systems import pairing_settings
 
 __all__ = ["Spell", "second_echoes", "split_evidence"]
@@ -31,12 +31,13 @@ class Spell(NamedTuple):
     time_to: float  # s
 
 
-def split_evidence(system: LocalSystem, settings: SystemsSettings) -> Evidence | None:
+def split_evidence(system: LocalSystem, settings: SystemsSettings, filters: FilterSettings) -> Evidence | None:
     """Return the evidence that tracks of one radar are one object, from the reports made in motion; None without any.
 
     Args:
         system: a radar with several local tracks; other systems tell targets apart by their transponders.
         settings: the distance between echoes to expect.
+        filters: how objects move.
     """
     view = system.view
     moving = np.isfinite(view.ray[:, 0]) & (np.hypot(view.velocity[:, 0], view.velocity[:, 1]) > _MOVING)
@@ -47,7 +48,7 @@ def split_evidence(system: LocalSystem, settings: SystemsSettings) -> Evidence |
     last[:-1] = (np.diff(np.floor(rows.time / _APART)) != 0) | (np.diff(rows.track) != 0)
     ids, number = np.unique(rows.track[last], return_inverse=True)
     rows = LocalTracks(number, rows.time[last], rows.z[last], rows.R[last])
-    pairing = pairing_settings([system], settings, settings.split_offset)
+    pairing = pairing_settings([system], settings, filters, settings.split_offset)
     reach = _REACH * settings.split_offset
     found = pair_evidence(rows, rows, pairing, reach=reach, window=0.5 * settings.window)
     return found._replace(pairs=ids[found.pairs])

@@ -11,7 +11,7 @@ from saltus.identify import PairSettings
 from saltus.tracks.bias import effects, second_order, spread
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.registration import Registration, RegistrationSettings, register
-from saltus.tracks.settings import SystemsSettings
+from saltus.tracks.settings import FilterSettings, SystemsSettings
 
 __all__ = ["Registered", "lasting_difference", "pairing_settings", "register_all", "short_difference"]
 
@@ -42,7 +42,7 @@ def register_all(
     names = [s.name for s in systems]
     if settings.reference and settings.reference not in names:
         raise ModelError(f"systems.reference = {settings.reference!r} names none of the systems: {', '.join(names)}.")
-    pairing = pairing_settings(systems, settings, 0.0)
+    pairing = PairSettings(speed_sigma=settings.speed)
     order = sorted(range(len(systems)), key=lambda k: (systems[k].name != settings.reference, *_trust(systems[k])))
     done = {order[0]: systems[order[0]]}
     how = {order[0]: Registered(systems[order[0]].name, "", None)}
@@ -69,12 +69,28 @@ def _moved(system: LocalSystem, found: Registration) -> LocalSystem:
     return system._replace(view=view)
 
 
-def pairing_settings(systems: Sequence[LocalSystem], settings: SystemsSettings, lasting: float) -> PairSettings:
-    """What is assumed of objects: they are where the narrowest system sees any; systems differ by `lasting` metres."""
+def pairing_settings(
+    systems: Sequence[LocalSystem], settings: SystemsSettings, filters: FilterSettings, lasting: float
+) -> PairSettings:
+    """What is assumed of objects: they move as tracks do, and are where the narrowest system sees any.
+
+    Turns and the hardest acceleration are one level of acceleration here, that lasts as long as one of each.
+
+    Args:
+        systems: those compared.
+        settings: speeds, and how long differences last.
+        filters: the filters of tracks.
+        lasting: standard deviation of the difference between systems, m.
+    """
     seen = [s.view.tracks.z for s in systems if len(s.view.tracks.z) > 2]
     z = min(seen, key=lambda z: float(np.linalg.det(np.cov(z.T)))) if seen else np.zeros((0, 2))
     cov = np.cov(z.T) if len(z) else 1e8 * np.eye(2)
+    *stays, last = filters.sojourn_h
+    turns = filters.turn_sojourn if stays and filters.turn_rate else 0.0
     return PairSettings(
+        accel=filters.accel_h,
+        sojourn=(*stays, last + turns),
+        accel_time=filters.accel_time or PairSettings().accel_time,
         offset_cov=lasting**2 * np.eye(2),
         offset_time=settings.offset_time,
         region_mean=z.mean(axis=0) if len(z) else np.zeros(2),

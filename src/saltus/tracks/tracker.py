@@ -9,20 +9,21 @@ import numpy.typing as npt
 from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
 from saltus.tracks.background import densities
-from saltus.tracks.faults import SourceCondition, plot_law, weighty
+from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.kept import Kept
-from saltus.tracks.kinematics import Chosen, make_kinematics
+from saltus.tracks.kinematics import make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
-from saltus.tracks.publish import Told, coasted_rows, updated_rows
+from saltus.tracks.publish import Told, coast, updated_rows
 from saltus.tracks.rows import Fates, Fed, Rows, join_fates, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.sights import sight
 from saltus.tracks.slices import rounds, slices
 from saltus.tracks.sources import TrackerSetup
 from saltus.tracks.starts import Starts
+from saltus.tracks.step import Judged, absorb, judge
 
 __all__ = ["Tracker"]
 
@@ -67,7 +68,7 @@ class Tracker:
         self._periods = np.array([s.period for s in setup.sources])
         self._gate = Gate(self._settings, self._filters, self._periods, use_identity=self._use_identity)
         new = setup.sources[len(self._sources) :]
-        self._sources += [SourceCondition(plot_law(self._settings, polar=s.polar), self._settings) for s in new]
+        self._sources += [SourceCondition(plot_law(self._settings, s.kind), self._settings) for s in new]
 
     @property
     def conditions(self) -> list[SourceCondition]:
@@ -136,12 +137,7 @@ class Tracker:
 
     def _housekeep(self, now: float) -> None:
         """Publish what coasts; drop what is overdue or moves as no target does."""
-        rows, expected = self._life.to_coast(now)
-        while len(rows):
-            ahead = self._kinematics.predicted(rows, expected - self._life.time[rows])
-            moments = ahead.moments(np.arange(len(rows)))
-            self._rows.append(coasted_rows(self._life, rows, moments, expected, now))
-            rows, expected = self._life.to_coast(now)
+        self._rows += coast(self._kinematics, self._life, now)
         life = self._life
         ended = np.unique(np.concatenate([life.overdue(now), life.too_fast(), life.repeated()]))
         if len(ended):
@@ -157,17 +153,12 @@ class Tracker:
             index = index[~bearings]
             if not len(index):
                 return
-        m, time = self._m, float(self._m.time[index[-1]])
-        source = self._sources[m.source[index[0]]]
-        prior = source.predicted(time)
+        m = self._m
+        source, prior = self._source(index)
         gated = self._gate(self._kinematics, life, m, index, source, prior)
-        log_f = gated.copies.score(gated.copy, gated.plan, gated.covs)
-        chosen = assign(gated.pairs, self._gain(gated, index, logsumexp(source.weights(prior) + log_f, (1,))[:, 0]))
+        chosen, judged = self._decide(gated, index, self._gain(gated, index))
         rows, plots = gated.pairs.track[chosen], index[gated.pairs.plot[chosen]]
-        voice = source.voice(life.id[rows], m.time[plots], life.status[rows] == CONFIRMED)
-        weights = source.absorb(time, prior, log_f[chosen], voice)
-        p = _normalised(weights + log_f[chosen])
-        wrong, fault = source.law.faulty(p)
+        wrong = judged.wrong
         again = self._twice_wrong(rows, plots, wrong)
         life.renew(rows[again])
         self._rename(rows[again])
@@ -177,12 +168,13 @@ class Tracker:
         if new.any():
             first = self._last.of(rows[new])
             self._kinematics.write(rows[new], self._starts.of_two(first, life.time[rows[new]], m, plots[new]))
-        self._update(rows[~new], gated, chosen[~new], weights[~new], p[~new])
+        absorb(self._kinematics, rows[~new], gated, chosen[~new], judged.take(~new))
         self._enter(rows, plots, wait, gated.height_used[chosen], sound=new | (wrong <= 0.5))
         life.p_fault[rows] = np.where(new, np.nan, wrong)
         # Neither a start nor a fault, nor a degraded source, says whether the filter's innovations are what it thinks.
         d2 = np.where(new | (wrong > 0.5) | source.degraded, np.nan, gated.d2[chosen])
-        told = Told(gated.centre[chosen], gated.gate_cov[chosen], d2, np.where(new, 0, fault), source.p_degraded)
+        fault = np.where(new, 0, judged.fault)
+        told = Told(gated.centre[chosen], gated.gate_cov[chosen], d2, life.p_fault[rows], fault, source.p_degraded)
         self._publish(rows, plots, told)
         left = np.ones(len(index), bool)
         left[gated.pairs.plot[chosen]] = False
@@ -229,36 +221,51 @@ class Tracker:
         live = life.rows()
         return self._last.of(rows[~np.isin(life.plot[rows], life.plot[live[life.status[live] == SEED]])])
 
-    def _update(self, rows: _Index, gated: Gated, pairs: _Index, log_weights: _Array, p: _Array) -> None:
-        """Condition tracks on the plots chosen, each a mixture of what may be wrong with it."""
-        each, which, start = weighty(p)
-        pair = pairs[each]
-        hypotheses = Chosen(
-            gated.copy[pair], start, gated.plan.take(pair), gated.covs[pair, which], log_weights[each, which]
-        )
-        self._kinematics.absorb(rows, gated.copies, hypotheses)
+    def _source(self, index: _Index) -> tuple[SourceCondition, _Array]:
+        """Return the source of reports, and log probabilities of its conditions at the last of them."""
+        source = self._sources[self._m.source[index[0]]]
+        return source, source.predicted(float(self._m.time[index[-1]]))
+
+    def _decide(self, gated: Gated, index: _Index, gain: _Array) -> tuple[_Index, Judged]:
+        """Choose pairs, and judge what is wrong with the reports chosen.
+
+        Args:
+            gated: pairs of tracks and reports.
+            index: the reports of one source.
+            gain: log-likelihood ratio of each pair to report and track apart, but for the density of the report.
+        """
+        m, life = self._m, self._life
+        source, prior = self._source(index)
+        log_f = gated.score()
+        chosen = assign(gated.pairs, gain + logsumexp(source.weights(prior) + log_f, (1,))[:, 0])
+        rows, plots = gated.pairs.track[chosen], index[gated.pairs.plot[chosen]]
+        voice = source.voice(life.id[rows], m.time[plots], life.status[rows] == CONFIRMED)
+        return chosen, judge(source, float(m.time[index[-1]]), prior, log_f[chosen], voice)
 
     def _sight(self, index: _Index) -> None:
         """Absorb the bearings of one source in one slice: they update confirmed tracks, and do nothing else."""
         settings, m, life = self._settings, self._m, self._life
-        seen = sight(self._kinematics, life, m, index, self._gate.height)
+        source, prior = self._source(index)
+        gated = sight(self._kinematics, life, m, index, self._gate, source, prior)
         detection = settings.detection_probability
-        gain = seen.log_f - np.log(settings.clutter_density_azimuth) + np.log(detection / (1.0 - detection))
-        chosen = assign(seen.pairs, gain)
-        rows, plots = seen.pairs.track[chosen], index[seen.pairs.plot[chosen]]
-        sure = Chosen.sure(seen.copy[chosen], seen.plan.take(chosen), seen.cov[chosen])
-        self._kinematics.absorb(rows, seen.copies, sure)
+        gain = np.log(detection / (1.0 - detection)) - np.log(settings.clutter_density_azimuth)
+        chosen, judged = self._decide(gated, index, np.full(len(gated.copy), gain))
+        rows, plots = gated.pairs.track[chosen], index[gated.pairs.plot[chosen]]
+        absorb(self._kinematics, rows, gated, chosen, judged)
         life.sighted(rows, m.time[plots])
         self._track_id[plots] = life.id[rows]
-        nothing, none = np.full(len(rows), np.nan), np.zeros(len(rows), np.int8)
-        self._publish(rows, plots, Told(seen.centre[chosen], seen.centre_cov[chosen], nothing, none, np.nan))
+        centre, cov, nothing = gated.centre[chosen], gated.gate_cov[chosen], np.full(len(rows), np.nan)
+        self._publish(rows, plots, Told(centre, cov, nothing, judged.wrong, judged.fault, source.p_degraded))
 
-    def _gain(self, gated: Gated, index: _Index, log_f: _Array) -> _Array:
-        """Log-likelihood ratio of "this plot is this track's" against "the track missed and the plot is new"."""
+    def _gain(self, gated: Gated, index: _Index) -> _Array:
+        """Log-likelihood ratio of "this plot is this track's" against "the track missed and the plot is new".
+
+        Without the density of the plot, which is a matter of hypotheses.
+        """
         settings, m, life = self._settings, self._m, self._life
         track, plot = gated.pairs.track, index[gated.pairs.plot]
         detection = settings.detection_probability
-        gain = log_f - np.log(self._density.plane[plot]) + np.log(detection / (1.0 - detection))
+        gain = np.log(detection / (1.0 - detection)) - np.log(self._density.plane[plot])
         has_height, new_height = np.isfinite(m.position[plot, 2]), self._density.height[plot]
         gain = gain + np.where(gated.height_used, np.log((1.0 - settings.altitude_outlier) / new_height), 0.0)
         gain = gain + np.where(has_height & ~gated.height_used, np.log(settings.altitude_outlier), 0.0)
@@ -342,7 +349,3 @@ class Tracker:
             life, moments = self._life, self._kinematics.moments(rows)
             life.mean[rows], life.cov[rows] = moments.mean, moments.cov
             self._rows.append(updated_rows(life, rows, moments, self._m, plots, told, self._known))
-
-
-def _normalised(log_p: _Array) -> _Array:
-    return np.asarray(np.exp(log_p - logsumexp(log_p, (1,))))
