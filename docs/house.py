@@ -28,6 +28,7 @@ WORDS = {
     "models": "what the world is: chains, motion, sensors, priors",
     "io": "ASTERIX and tables to records",
     "framing": "containers and captures to data blocks",
+    "asterix": "data blocks to columns and back",
     "records": "reports as arrays, SI units and radians",
     "geo": "the ellipsoid",
     "linalg": "small matrix algebra",
@@ -39,7 +40,7 @@ WORDS = {
     "shapes": "shapes of arrays in annotations",
 }
 _COLOURS = (
-    (("errors", "shapes", "geo", "records", "framing", "io"), "#eef3ee", "#a9c2aa"),
+    (("errors", "shapes", "geo", "records", "asterix", "framing", "io"), "#eef3ee", "#a9c2aa"),
     (("models", "simulate", "decisions", "filters", "identify", "tracks"), "#fbeeea", "#dba792"),
     (("evaluate", "montecarlo", "studies"), "#f3eef7", "#bfa9d1"),
     ((), "#e9f0f8", "#9db8d6"),

@@ -15,6 +15,7 @@
 
 #include "arguments.hpp"
 
+void add_asterix(nanobind::module_& module);
 void bind_asterix_frames(nanobind::module_& module);
 
 namespace {
@@ -316,7 +317,8 @@ class Bank {
 }  // namespace
 
 NB_MODULE(_native, module) {
-  module.doc() = "Compiled twins of saltus.filters, saltus.framing.";
+  module.doc() = "Compiled twins of saltus.filters, saltus.asterix, saltus.framing.";
+  add_asterix(module);
   bind_asterix_frames(module);
   module.def("instruction_sets", &instruction_sets);
   module.def("lanes", [](const std::string& isa) { return kernel_of(isa).lanes; });

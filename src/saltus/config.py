@@ -39,9 +39,9 @@ from typing import Annotated, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
+from saltus.asterix.layout import editions as known_editions
 from saltus.errors import ModelError
 from saltus.framing import NAMES
-from saltus.io.layout import categories
 from saltus.records import System
 from saltus.text import brief, cut, shown
 from saltus.toml import load_toml
@@ -259,7 +259,7 @@ def _editions(path: Path | str, table: object) -> dict[int, str]:
     for key, value in table.items():
         if not re.fullmatch("[0-9]{1,3}", key) or not 1 <= int(key) <= 255 or not isinstance(value, str):
             raise ModelError(f"{path}: [editions] {cut(key)} = {brief(value)}: write {_HINTS['editions']}.")
-        known = categories().get(int(key), {value: None})
+        known = known_editions(int(key)) or (value,)
         if value not in known:
             raise ModelError(
                 f"{path}: [editions] {cut(key)} = {brief(value)}: not known; choose one of {', '.join(known)}."

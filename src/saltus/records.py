@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-__all__ = ["REASONS", "Contents", "Kind", "Plots", "Recording", "Source", "System", "Traits"]
+__all__ = ["REASONS", "Contents", "Datum", "Kind", "Plots", "Recording", "Source", "System", "Traits"]
 
 # Why a report is not used. Index 0 means usable; readers set the codes below, trackers never change them.
 REASONS = (
@@ -44,6 +44,13 @@ class Kind:
     PLANE = 2  # east, north (and up) from the source's site
     GEODETIC = 3  # latitude, longitude
     BEARING = 4  # azimuth (and elevation) alone, from the source's site
+
+
+class Datum:
+    """What a geometric height counts from (values of `Plots.datum`)."""
+
+    MEAN_SEA_LEVEL = 1
+    ELLIPSOID = 2  # WGS-84
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +138,12 @@ class Plots:
     latitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad, WGS-84
     longitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad
     altitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m; pressure altitude if from Mode C
+    height: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m, geometric, above `datum`
+    datum: npt.NDArray[np.int8] = _column(np.int8, -1)  # of the height: a `Datum`
+    sigma: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # m, of each horizontal axis, as the report says
+    containment: npt.NDArray[np.float64] = _column(
+        np.float64, np.nan
+    )  # m, radius whose integrity the report vouches for
     # The site of this report, of a source that moves; NaN = the source's own site.
     observer_latitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad
     observer_longitude: npt.NDArray[np.float64] = _column(np.float64, np.nan)  # rad

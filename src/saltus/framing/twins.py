@@ -63,7 +63,8 @@ def compiled() -> Scanner | None:
         return None
 
     def scan_frames(data: _Bytes, start: int, stop: int, container: Container, known: Known) -> Scan:
-        return Scan(*native.scan_frames(data, start, stop, _numbers(container), known.view(np.uint8)))
+        found = Scan(*native.scan_frames(data, start, stop, _numbers(container), known.view(np.uint8)))
+        return found._replace(offset=found.offset.view(np.int64), frame=found.frame.view(np.int64))  # not long long
 
     def holds_frames(data: _Bytes, start: int, stop: int, container: Container, known: Known, count: int) -> bool:
         return bool(native.holds_frames(data, start, stop, _numbers(container), known.view(np.uint8), count))
@@ -100,7 +101,8 @@ class _Compiled:
 
     def scan(self, data: _Bytes, start: int, stop: int, base: int) -> Taken:
         taken = Taken(*self._capture.scan(data, start, stop, base))
-        return taken._replace(cut=taken.cut.view(np.bool_))
+        offset, at = taken.offset.view(np.int64), taken.at.view(np.int64)
+        return taken._replace(offset=offset, at=at, cut=taken.cut.view(np.bool_))
 
     def record(self, data: _Bytes, position: int, stop: int) -> int:
         return int(self._capture.record(data, position, stop))

@@ -1,103 +1,80 @@
-"""Walked records to target reports and lines of contents."""
+"""Records of a recording, as columns, to target reports and lines of contents."""
 
 import datetime
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.io.blocks import Block
-from saltus.io.cat010 import CAT010
-from saltus.io.cat021 import CAT021
-from saltus.io.cat034 import CAT034
-from saltus.io.cat048 import CAT048
-from saltus.io.cat062 import CAT062
-from saltus.io.clock import DAY, day_offsets
-from saltus.io.columns import Category, Columns, Decoded
-from saltus.io.layout import Layout, Malformed
+from saltus.asterix.codec import Records, announced
+from saltus.asterix.layout import Layout
+from saltus.io.categories import CATEGORIES
+from saltus.io.clock import DAY, complete, day_offsets
+from saltus.io.columns import SOURCE, Columns, Decoded
 from saltus.io.part import Part, revisit, rotating
 from saltus.records import Contents, Kind, Plots, Source, System, Traits
 
-__all__ = ["CATEGORIES", "TIME_ITEM", "Records", "assemble"]
-
-CATEGORIES = {c.number: c for c in (CAT010, CAT021, CAT034, CAT048, CAT062)}
-
-# time of day of categories that are only counted
-TIME_ITEM = {2: "030", 8: "090", 19: "140", 20: "140", 23: "070", 25: "070", 63: "030", 65: "030"}
-_TURNS = {48: 34}  # target category -> category of its service messages
+__all__ = ["Found", "assemble"]
 
 
-@dataclass(slots=True)
-class Records:
-    """The records of one category as they are walked."""
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The records of one category of a recording."""
 
     layout: Layout
-    wanted: frozenset[str]
-    fspecs: list[bytes] = field(default_factory=list)
-    sequence: list[int] = field(default_factory=list)  # position among all records of the file
-    clock: list[float] = field(default_factory=list)
-    items: dict[str, tuple[list[int], list[bytes]]] = field(default_factory=dict)
+    data: npt.NDArray[np.uint8]
+    records: Records
+    columns: Columns
+    sequence: npt.NDArray[np.int64]  # rises in the order in which all records of the recording came
+    clock: npt.NDArray[np.float64]  # s, UTC, when each was captured, NaN = not known
 
-    def add(self, block: Block, sequence: int) -> int:
-        """Take the records of a block; return how many. Malformed carries what stopped it, whole records stay."""
-        data, position, end = block.data, 3, len(block.data)
-        start = len(self.fspecs)
-        while position < end:
-            fspec, spans, position = self.layout.walk(data, position, end)
-            if "010" not in spans:
-                raise Malformed(position, "a record does not name its source (item 010)")
-            k = len(self.fspecs)
-            for name in self.wanted & spans.keys():
-                index, chunks = self.items.setdefault(name, ([], []))
-                index.append(k)
-                chunks.append(data[spans[name][0] : spans[name][1]])
-            self.fspecs.append(fspec)
-            self.sequence.append(sequence + k - start)
-            self.clock.append(block.clock)
-        return len(self.fspecs) - start
+    def __len__(self) -> int:
+        """Number of records."""
+        return len(self.sequence)
 
-    def columns(self) -> Columns:
-        """The wanted items, by name."""
-        return Columns(self.layout, len(self.fspecs), self.items)
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """What became of the records of one category."""
+
+    found: Found
+    decoded: Decoded
+    systems: list[System]
+    system_of: npt.NDArray[np.int64]  # of each record
 
 
 def assemble(
     name: str,
-    records: Mapping[int, Records],
+    found: Mapping[int, Found],
     notes: Mapping[int, tuple[str, ...]],
     problems: list[str],
     date: datetime.date | str | None,
 ) -> Part:
-    """Turn walked records into target reports and lines of contents."""
-    walked = {number: r for number, r in records.items() if r.fspecs}
-    decoded = {number: _decode(number, r.columns()) for number, r in walked.items()}
-    times = _times(walked, decoded, date)
+    """Turn records into target reports and lines of contents."""
+    read = {number: _read(number, records) for number, records in found.items() if len(records)}
+    times = _times(read, date, name, problems)
     if date is None:
         problems.append(f"{name}: no date given: times count from 1970-01-01; give --date YYYY-MM-DD.")
     plots, tracks, contents = [], [], []
-    turns = _turns(walked, decoded, times)
-    for number, r in walked.items():
-        systems, system_of = _systems(number, r.columns())
-        traits = CATEGORIES[number].traits if number in CATEGORIES else Traits()
-        kinds = np.asarray(decoded[number].columns.get("kind", np.full(len(system_of), Kind.NONE)))
-        sources = tuple(
-            Source(s, rotating(traits, kinds[system_of == k]), **decoded[number].steps) for k, s in enumerate(systems)
-        )
-        part = _plots(name, sources, system_of, times[number], decoded[number])
+    turns = _turns(read, times)
+    for number, r in read.items():
+        part = _plots(name, CATEGORIES[number].traits, r, times[number])
         plots.append(part)
-        table = decoded[number].tracks
-        if table is not None:
-            labels = [str(systems[k]) for k in system_of]
-            tracks.append(
-                table.add_column(0, "system", pa.array(labels)).add_column(1, "time", pa.array(times[number]))
-            )
-        for k, system in enumerate(systems):
-            line = _contents(name, system, r, decoded[number], times[number], system_of == k, part, turns)
-            extra = () if number in CATEGORIES else ("counted only: no target reports are taken from this category",)
-            contents.append(replace(line, notes=(*notes[number], *extra)))
+        if r.decoded.tracks is not None:
+            tracks.append(_tracks(r, r.decoded.tracks, times[number]))
+        sets, which = announced(r.found.data, r.found.records, r.found.layout)
+        for k, system in enumerate(r.systems):
+            mine = r.system_of == k
+            fields: Counter[str] = Counter()
+            for items, n in zip(sets, np.bincount(which[mine], minlength=len(sets)).tolist(), strict=True):
+                fields.update({f"I{number:03d}/{item}": n for item in items if n})
+            line = _contents(name, system, r, times[number], mine, part, turns)
+            extra = ("counted only: no target reports are taken from this category",)
+            said = (*notes[number], *(extra if CATEGORIES[number].counted else ()))
+            contents.append(replace(line, fields=dict(sorted(fields.items())), notes=said))
     with_reports = [p for p in plots if len(p)] or plots[:1]
     return Part(
         _one_file(Plots.concat(with_reports), name),
@@ -109,30 +86,23 @@ def assemble(
     )
 
 
-def _decode(number: int, columns: Columns) -> Decoded:
-    category: Category | None = CATEGORIES.get(number)
-    if category is not None:
-        return category.decode(columns)
-    item = TIME_ITEM.get(number)
-    return Decoded(
-        time_of_day=columns.number(item) if item else np.full(columns.n, np.nan),
-        is_report=np.zeros(columns.n, np.bool_),
-        types=np.full(columns.n, -1, np.int64),
-        labels={},
-        columns={},
-        new_cycle=np.zeros(columns.n, np.bool_),
-        steps={},
-    )
+def _read(number: int, found: Found) -> _Read:
+    first, stop = found.columns.spans(SOURCE).T
+    octets = found.data
+    word = octets[first].astype(np.int64) << 8 | octets[np.minimum(first + 1, stop - 1)]
+    values, which = np.unique(word, return_inverse=True)
+    systems = [System(number, int(v) >> 8, int(v) & 255) for v in values]
+    return _Read(found, CATEGORIES[number].decode(found.columns), systems, which.astype(np.int64))
 
 
 def _times(
-    records: Mapping[int, Records], decoded: Mapping[int, Decoded], date: datetime.date | str | None
+    read: Mapping[int, _Read], date: datetime.date | str | None, name: str, problems: list[str]
 ) -> dict[int, npt.NDArray[np.float64]]:
     """Times of all records, s, UTC: midnights are counted over the whole file, or told by the capture clock."""
-    sequence = np.concatenate([r.sequence for r in records.values()])
-    tod = np.concatenate([d.time_of_day for d in decoded.values()])
+    sequence = np.concatenate([r.found.sequence for r in read.values()])
+    tod = np.concatenate([_time_of_day(number, read, name, problems) for number in read])
     if isinstance(date, str):
-        clock = np.concatenate([r.clock for r in records.values()])
+        clock = np.concatenate([r.found.clock for r in read.values()])
         days = np.round((clock - tod) / DAY)
         time = tod + DAY * np.where(np.isnan(days), np.nanmedian(days) if np.isfinite(days).any() else 0.0, days)
     else:
@@ -141,54 +111,76 @@ def _times(
         days[order] = day_offsets(tod[order])
         first = (date or datetime.date(1970, 1, 1)) - datetime.date(1970, 1, 1)
         time = tod + DAY * (days + first.days)
-    bounds = np.cumsum([0] + [len(r.fspecs) for r in records.values()])
-    return {n: time[a:b] for n, a, b in zip(records, bounds[:-1], bounds[1:], strict=True)}
+    bounds = np.cumsum([0] + [len(r.found) for r in read.values()])
+    return {n: time[a:b] for n, a, b in zip(read, bounds[:-1], bounds[1:], strict=True)}
 
 
-def _systems(number: int, columns: Columns) -> tuple[list[System], npt.NDArray[np.int64]]:
-    """The sources of a category's records, and which each record is of."""
-    index, chunks = columns.items["010"]
-    word = np.zeros(columns.n, np.int64)
-    word[index] = [int.from_bytes(chunk[:2], "big") for chunk in chunks]
-    values, which = np.unique(word, return_inverse=True)
-    return [System(number, int(v) >> 8, int(v) & 255) for v in values], which.astype(np.int64)
+def _time_of_day(number: int, read: Mapping[int, _Read], name: str, problems: list[str]) -> npt.NDArray[np.float64]:
+    """Times of day of a category's records; truncated ones are completed, or become NaN, and a problem says so."""
+    r = read[number]
+    modulus = r.decoded.time_modulus
+    if not modulus:
+        return r.decoded.time_of_day
+    time = complete(r.decoded.time_of_day, modulus, _reference(number, read))
+    lost = np.count_nonzero(np.isnan(time) & ~np.isnan(r.decoded.time_of_day))
+    if lost:
+        problems.append(
+            f"{name}: {lost} records of category {number} tell their time modulo {modulus:g} s only, and neither a "
+            f"message of category {CATEGORIES[number].turns} of their source nor a capture clock completes it: they "
+            "have no time. Record the service messages too, or capture packets."
+        )
+    return time
 
 
-def _plots(
-    name: str,
-    sources: tuple[Source, ...],
-    system_of: npt.NDArray[np.int64],
-    time: npt.NDArray[np.float64],
-    decoded: Decoded,
-) -> Plots:
+def _reference(number: int, read: Mapping[int, _Read]) -> npt.NDArray[np.float64]:
+    """A time of day near each record: the last of its source's service messages, else the next, else its capture."""
+    r = read[number]
+    near = r.found.clock % DAY
+    service = read.get(CATEGORIES[number].turns or 0)
+    if service is None:
+        return near
+    for k, system in enumerate(r.systems):
+        said = [j for j, s in enumerate(service.systems) if (s.sac, s.sic) == (system.sac, system.sic)]
+        told = np.isin(service.system_of, said) & np.isfinite(service.decoded.time_of_day)
+        if told.any():
+            mine = r.system_of == k
+            last = np.searchsorted(service.found.sequence[told], r.found.sequence[mine]) - 1
+            near[mine] = service.decoded.time_of_day[told][np.maximum(last, 0)]
+    return near
+
+
+def _plots(name: str, traits: Traits, r: _Read, time: npt.NDArray[np.float64]) -> Plots:
+    kinds = np.asarray(r.decoded.columns.get("kind", np.full(len(time), Kind.NONE)))
+    sources = tuple(
+        Source(s, rotating(traits, kinds[r.system_of == k]), **r.decoded.steps) for k, s in enumerate(r.systems)
+    )
     columns = {
-        **decoded.columns,
+        **r.decoded.columns,
         "time": time,
-        "source": system_of,
+        "source": r.system_of,
         "file": np.zeros(len(time)),
         "record": np.arange(len(time)),
     }
-    return Plots.build(len(time), sources, (name,), columns).take(np.flatnonzero(decoded.is_report))
+    return Plots.build(len(time), sources, (name,), columns).take(np.flatnonzero(r.decoded.is_report))
+
+
+def _tracks(r: _Read, table: pa.Table, time: npt.NDArray[np.float64]) -> pa.Table:
+    labels = pa.array([str(system) for system in r.systems]).take(pa.array(r.system_of))
+    table = table.add_column(0, "system", labels).add_column(1, "time", pa.array(time))
+    return table.filter(pa.array(r.decoded.is_report))
 
 
 def _one_file(plots: Plots, name: str) -> Plots:
     """Categories were joined as if they were files: make them one again."""
-    columns = {c: getattr(plots, c) for c in plots.column_names()}
-    columns["file"] = np.zeros(len(plots), np.int32)
-    return Plots.build(len(plots), plots.sources, (name,), columns)
+    return replace(plots, files=(name,), file=np.zeros(len(plots), np.int32))
 
 
-def _turns(
-    records: Mapping[int, Records],
-    decoded: Mapping[int, Decoded],
-    times: Mapping[int, npt.NDArray[np.float64]],
-) -> dict[System, float]:
+def _turns(read: Mapping[int, _Read], times: Mapping[int, npt.NDArray[np.float64]]) -> dict[System, float]:
     """Median time between two starts of a cycle of each system that sends them, s."""
     found = {}
-    for number, d in decoded.items():
-        systems, system_of = _systems(number, records[number].columns())
-        for k, system in enumerate(systems):
-            starts = np.unique(times[number][d.new_cycle & (system_of == k)])
+    for number, r in read.items():
+        for k, system in enumerate(r.systems):
+            starts = np.unique(times[number][r.decoded.new_cycle & (r.system_of == k)])
             if len(starts) >= 3:
                 found[system] = float(np.median(np.diff(starts[np.isfinite(starts)])))
     return found
@@ -197,35 +189,33 @@ def _turns(
 def _contents(
     name: str,
     system: System,
-    records: Records,
-    decoded: Decoded,
+    r: _Read,
     time: npt.NDArray[np.float64],
     mine: npt.NDArray[np.bool_],
     plots: Plots,
     turns: Mapping[System, float],
 ) -> Contents:
-    """One line of `saltus info`; rejected reports are counted when the files are merged."""
+    """One line of `saltus info`, without its fields; rejected reports are counted when the files are merged."""
     number = system.category or 0
-    fields: Counter[str] = Counter()
-    for fspec, n in Counter(records.fspecs[k] for k in np.flatnonzero(mine)).items():
-        fields.update({f"I{number:03d}/{item}": n for item in records.layout.names_in(fspec)})
+    decoded = r.decoded
     kinds, counts = np.unique(decoded.types[mine], return_counts=True)
     own = plots.take(np.flatnonzero(plots.source == plots.sources.index(_source_of(plots, system))))
-    service = System(_TURNS.get(number, number), system.sac, system.sic)
+    service = System(CATEGORIES[number].turns or number, system.sac, system.sic)
     period = turns.get(service, turns.get(system, np.nan))
     if np.isnan(period):
-        period = revisit(own.time, own.icao24, own.local_id if number == 62 else own.mode3a, own.local_id)
+        numbered = decoded.tracks is not None  # another system's tracks are told apart by their numbers
+        period = revisit(own.time, own.icao24, own.local_id if numbered else own.mode3a, own.local_id)
     span = time[mine & np.isfinite(time)]
     return Contents(
         file=name,
         system=system,
-        edition=records.layout.edition,
+        edition=r.found.layout.edition,
         n_records=int(np.count_nonzero(mine)),
         n_reports=int(np.count_nonzero(mine & decoded.is_report)),
         time_from=float(span.min()) if len(span) else float("nan"),
         time_to=float(span.max()) if len(span) else float("nan"),
         update_period=float(period),
-        fields=dict(sorted(fields.items())),
+        fields={},
         rejected={},
         n_by_type={
             decoded.labels.get(int(kind), "type not given" if kind < 0 else f"type {kind}"): int(n)

@@ -9,18 +9,26 @@ cannot be told apart, so it counts as no record, and a problem names its byte.
 """
 
 import datetime
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from saltus.asterix.codec import Faults, find_records
+from saltus.asterix.layout import editions as known_editions
+from saltus.asterix.layout import layout
 from saltus.errors import DataError
-from saltus.io.assemble import CATEGORIES, TIME_ITEM, Records, assemble
-from saltus.io.blocks import Block, read_blocks
-from saltus.io.layout import Malformed, categories, layout
+from saltus.io.assemble import Found, assemble
+from saltus.io.blocks import Blocks, read_blocks
+from saltus.io.categories import CATEGORIES
+from saltus.io.columns import read_columns
 from saltus.io.part import Part
 from saltus.records import Contents, Plots, System
 
 __all__ = ["read_asterix"]
 
+_MOST = 1 << 16  # more than a block holds records
 _SAMPLE = 200  # blocks looked at to tell the edition
 _FITS, _ENOUGH = 0.5, 20  # an edition that parses less of this many blocks is not theirs
 _SURELY = 0.9  # an edition that parses as much is theirs, where the one asked for is not
@@ -48,43 +56,51 @@ def read_asterix(
         DataError: the file is empty, holds no record, or an edition does not exist or is plainly not the file's.
     """
     name = path.name
-    blocks, told, dated = read_blocks(path, framing, None)
+    blocks, told = read_blocks(path, framing, progress)
     if not path.stat().st_size:
         raise DataError(f"{path}: byte 0: the file is empty.")
     problems = list(told.problems)
     notes: dict[int, tuple[str, ...]] = {}
-    chosen: dict[int, str] = {}
+    found: dict[int, Found] = {}
     unread = []
-    for number in sorted({b.category for b in blocks}):
-        mine = [b for b in blocks if b.category == number]
+    broken: list[tuple[int, str]] = []
+    for number in np.unique(blocks.category).tolist():
+        place = np.flatnonzero(blocks.category == number)
+        mine = blocks.take(place)
         edition, note = _edition(number, mine, editions.get(number), name)
         if edition:
-            chosen[number], notes[number] = edition, (note,) if note else ()
+            notes[number] = (note,) if note else ()
+            held, faults = _parse(number, edition, mine, strict=False)
+            found[number] = replace(held, sequence=place[held.records.block] * _MOST + held.records.number)
+            broken += _told(name, mine, held, faults)
         else:
             unread.append(_unread(name, number, note))
-            problems.append(f"{name}: byte {mine[0].offset}: category {number} is not read: {note}")
-    records = _walk(blocks, chosen, problems, name, progress)
-    if any(r.fspecs for r in records.values()):
-        part = assemble(name, records, notes, problems, date if date or not dated else "capture clock")
+            problems.append(f"{name}: byte {mine.at[0]}: category {number} is not read: {note}")
+    broken.sort()
+    problems += [text for _, text in broken[:_TOLD]]
+    if len(broken) > _TOLD:
+        problems.append(f"{name}: {len(broken) - _TOLD} more blocks do not follow their definition.")
+    if any(len(f) for f in found.values()):
+        part = assemble(name, found, notes, problems, date if date or not blocks.dated else "capture clock")
         return part._replace(contents=(*part.contents, *unread))
     if not unread:
         over = ", ".join(f"{n} of {what}" for what, n in told.passed.items())
         said = (f" {problems[0]}" if problems else "") + (f" Passed over: {over}." if over else "")
         raise DataError(f"{path}: no ASTERIX record could be read: wrong format, category or edition?{said}")
-    return Part(Plots.build(0, (), (name,), {}), None, tuple(unread), tuple(problems), in_order=True, dated=dated)
+    return Part(Plots.build(0, (), (name,), {}), None, tuple(unread), tuple(problems), True, blocks.dated)
 
 
-def _edition(number: int, blocks: Sequence[Block], asked: str | None, name: str) -> tuple[str, str]:
+def _edition(number: int, blocks: Blocks, asked: str | None, name: str) -> tuple[str, str]:
     """Choose the edition: as asked, or the one whose definitions parse most of a sample; then the newest.
 
     Returns:
         The edition, "" when none fits, and a note unless the choice is plain.
     """
-    known = categories().get(number)
-    if known is None:
+    known = known_editions(number)
+    if not known:
         return "", f"{len(blocks)} blocks; no definition of it is known."
-    whole = [b for b in blocks if not b.cut] or list(blocks)
-    sample = whole[:: max(1, len(whole) // _SAMPLE)][:_SAMPLE]
+    whole = np.flatnonzero(~blocks.cut) if not blocks.cut.all() else np.arange(len(blocks))
+    sample = blocks.take(whole[:: max(1, len(whole) // _SAMPLE)][:_SAMPLE])
     if asked is not None:
         _check_asked(number, asked, sample, name)
         return asked, ""
@@ -104,14 +120,14 @@ def _edition(number: int, blocks: Sequence[Block], asked: str | None, name: str)
     return chosen, f"edition guessed: {span} parses {best[0]:.0%} of {len(sample)} sample blocks, others {others:.0%}"
 
 
-def _check_asked(number: int, asked: str, sample: Sequence[Block], name: str) -> None:
+def _check_asked(number: int, asked: str, sample: Blocks, name: str) -> None:
     """Refuse an edition that does not exist, or that most blocks do not follow while they follow another."""
-    known = categories()[number]
+    known = known_editions(number)
     if asked not in known:
         raise DataError(
             f"edition {asked!r} of category {number} is not known; choose one of {', '.join(known)} in [editions]."
         )
-    share = _parse(number, asked, sample)[1]
+    share = _share(_parse(number, asked, sample)[1], sample)
     if share >= _FITS or len(sample) < _ENOUGH:
         return
     scores = {edition: _score(number, edition, sample) for edition in known if edition != asked}
@@ -125,28 +141,26 @@ def _check_asked(number: int, asked: str, sample: Sequence[Block], name: str) ->
         )
 
 
-def _parse(number: int, edition: str, sample: Sequence[Block]) -> tuple[Records, float]:
-    """What an edition makes of the sample, and the share of its blocks that follow it."""
-    category = CATEGORIES.get(number)
-    records = Records(layout(number, edition), frozenset(category.items if category else ()))
-    n_good = 0
-    for block in sample:
-        try:
-            records.add(block, 0)
-            n_good += 1
-        except Malformed:
-            pass
-    return records, n_good / len(sample)
+def _parse(number: int, edition: str, blocks: Blocks, strict: bool = True) -> tuple[Found, Faults]:
+    """What an edition makes of blocks."""
+    form = layout(number, edition)
+    records, faults = find_records(blocks.data, blocks.offset, blocks.length, form, strict=strict)
+    columns = read_columns(blocks.data, records, form, CATEGORIES[number].fields)
+    return Found(form, blocks.data, records, columns, records.block, blocks.clock[records.block]), faults
 
 
-def _score(number: int, edition: str, sample: Sequence[Block]) -> tuple[float, float]:
+def _share(faults: Faults, sample: Blocks) -> float:
+    """Share of the blocks that follow the edition."""
+    return 1.0 - len(np.unique(faults.block[faults.record < 0])) / len(sample)
+
+
+def _score(number: int, edition: str, sample: Blocks) -> tuple[float, float]:
     """Share of the sample that an edition parses, and how well its numbers hang together."""
-    category = CATEGORIES.get(number)
-    records, share = _parse(number, edition, sample)
-    plausible = category.plausible if category else None
-    sense = plausible(records.columns()) if plausible and records.fspecs else 1.0
+    found, faults = _parse(number, edition, sample)
+    plausible = CATEGORIES[number].plausible
+    sense = plausible(found.columns) if plausible and len(found) else 1.0
     # A definition that parses by luck is betrayed by its numbers; single ones may be off in good recordings.
-    return share * (1.0 if sense > 0.5 else 0.0), round(sense, 1)
+    return _share(faults, sample) * (1.0 if sense > 0.5 else 0.0), round(sense, 1)
 
 
 def _unread(name: str, number: int, note: str) -> Contents:
@@ -155,40 +169,21 @@ def _unread(name: str, number: int, note: str) -> Contents:
     return Contents(name, System(number, None, None), "", 0, 0, nan, nan, nan, {}, {}, {}, (note,))
 
 
-def _walk(
-    blocks: Sequence[Block],
-    editions: Mapping[int, str],
-    problems: list[str],
-    name: str,
-    progress: Callable[[str, float], None] | None,
-) -> dict[int, Records]:
-    """Take the wanted items of all records, and note the blocks that do not follow their edition."""
-    records = {}
-    for number, edition in editions.items():
-        handled = CATEGORIES.get(number)
-        items = handled.items if handled else ("010", TIME_ITEM.get(number, "010"))
-        records[number] = Records(layout(number, edition), frozenset(items))
-    sequence = 0
-    broken: list[str] = []
-    for k, block in enumerate(blocks):
-        if progress is not None and k % 1000 == 0:
-            progress(name, k / len(blocks))
-        mine = records.get(block.category)
-        if mine is None:
-            continue
-        before = len(mine.fspecs)
-        try:
-            mine.add(block, sequence)
-        except Malformed as fault:
-            if not block.cut:
-                broken.append(
-                    f"{name}: byte {block.offset + fault.offset}: block of category {block.category} (edition "
-                    f"{mine.layout.edition}): {fault.what}; {len(mine.fspecs) - before} whole records of it are used."
-                )
-        sequence += len(mine.fspecs) - before
-    problems.extend(broken[:_TOLD])
-    if len(broken) > _TOLD:
-        problems.append(f"{name}: {len(broken) - _TOLD} more blocks do not follow their definition.")
-    if progress is not None:
-        progress(name, 1.0)
-    return records
+def _told(name: str, blocks: Blocks, held: Found, faults: Faults) -> list[tuple[int, str]]:
+    """Faults in words, with the byte of the file."""
+    whole = np.bincount(held.records.block, minlength=len(blocks))
+    form = held.layout
+    said = []
+    for k, index in enumerate(faults.block.tolist()):
+        if not blocks.cut[index]:
+            byte = int(blocks.at[index] + faults.offset[k] - blocks.offset[index])
+            what = (
+                f"{name}: byte {byte}: block of category {form.category} (edition {form.edition}): {faults.text(k)}; "
+            )
+            kept = (
+                "the record is used without it."
+                if faults.record[k] >= 0
+                else f"{whole[index]} whole records of it are used."
+            )
+            said.append((byte, what + kept))
+    return said

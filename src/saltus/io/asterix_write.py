@@ -1,12 +1,14 @@
 """Write simulated radar plots as ASTERIX: CAT048 target reports, CAT034 north and sector messages."""
 
-from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from saltus.asterix.codec import Column
+from saltus.asterix.encode import Encoded, blocks, encode
+from saltus.asterix.layout import editions, layout
 from saltus.errors import DataError
 from saltus.io.write import blamed, output_file
 
@@ -73,11 +75,12 @@ def write_cat048(
     names = [""] * n if callsign is None else [str(c) for c in np.asarray(callsign).tolist()]
     _check(path, time, columns, names, sac, sic)
     order = np.argsort(time, kind="stable")
-    blocks = _status_blocks(sac, sic, np.asarray(north_marker_times, np.float64), n_sectors)
-    breaks = [t for t, _ in blocks]
-    blocks += _plot_blocks(sac, sic, time, columns, names, order, breaks)
+    status, when = _status(sac, sic, np.asarray(north_marker_times, np.float64), n_sectors)
+    plot = {name: values[order] for name, values in columns.items()}
+    reports, begin = _plots(sac, sic, time[order], plot, [names[k] for k in order], when)
+    at = np.argsort(np.concatenate([when, begin]), kind="stable")  # a marker before the plots of its time
     with output_file(path) as temporary, blamed(temporary):
-        temporary.write_bytes(b"".join(block for _, block in sorted(blocks, key=lambda b: b[0])))
+        temporary.write_bytes(b"".join((status + reports)[k] for k in at))
 
 
 def _column(name: str, values: npt.ArrayLike | None, n: int, absent: float) -> npt.NDArray[np.float64]:
@@ -123,86 +126,78 @@ def _check(
             raise DataError(f"{path}: callsign[{k}] is {text!r}; use up to 8 capitals, digits, spaces.")
 
 
-def _status_blocks(sac: int, sic: int, north: npt.NDArray[np.float64], n_sectors: int) -> list[tuple[float, bytes]]:
-    """One block for each north marker, and sector crossings spread evenly up to the next one."""
+def _status(
+    sac: int, sic: int, north: npt.NDArray[np.float64], n_sectors: int
+) -> tuple[list[bytes], npt.NDArray[np.float64]]:
+    """A block for each north marker, and for sector crossings spread evenly up to the next one; and their times."""
     if not (np.isfinite(north).all() and (np.diff(north) > 0).all()):
         raise DataError("north_marker_times must be finite and increasing.")
     if not 2 <= n_sectors <= 256:
         raise DataError(f"n_sectors is {n_sectors}, which must lie in 2 to 256.")
-    from asterix import generated
-
-    category = generated.Cat_034_1_29
-
-    def block(t: float, items: Mapping[str, object]) -> tuple[float, bytes]:
-        common = {"010": (("SAC", sac), ("SIC", sic)), "030": _raw_time(t)}
-        values: Any = {**common, **items}
-        record = category.cv_record.create(values)
-        return t, category.create([record]).unparse().to_bytes()
-
-    blocks = []
-    for k, t in enumerate(north.tolist()):
-        after = north[k + 1] if k + 1 < len(north) else t + (t - north[k - 1] if k else 0.0)
-        period = float(after) - t
-        blocks.append(block(t, {"000": 1, **({"041": round(period / _TIME_LSB)} if period > 0 else {})}))
-        if k + 1 < len(north):
-            for sector in range(1, n_sectors):  # the north marker itself opens sector 0
-                crossing = {"000": 2, "020": (256 * sector) // n_sectors}
-                blocks.append(block(t + period * sector / n_sectors, crossing))
-    return blocks
+    if not len(north):
+        return [], north
+    turn = np.diff(north, append=2 * north[-1] - north[-2] if len(north) > 1 else north[-1])
+    sector = np.arange(1, n_sectors)  # the north marker itself opens sector 0
+    crossing = (north[:-1, None] + turn[:-1, None] * sector / n_sectors).ravel()
+    time = np.concatenate([north, crossing])
+    marker = np.arange(len(time)) < len(north)
+    angle = np.concatenate([np.zeros(len(north)), np.tile((256 * sector) // n_sectors, len(north) - 1)])
+    period = np.concatenate([turn, np.zeros(len(crossing))])
+    columns: dict[str, npt.ArrayLike | Column] = {
+        **_source(sac, sic, len(time)),
+        "000": np.where(marker, 1, 2),
+        "020": Column(angle.astype(np.int64), ~marker, None),
+        "030": _raw_time(time),
+        "041": Column(np.rint(period / _TIME_LSB).astype(np.int64), period > 0, None),
+    }
+    return _blocks(34, encode(layout(34, editions(34)[-1]), columns), np.arange(len(time))), time
 
 
-def _plot_blocks(
+def _plots(
     sac: int,
     sic: int,
     time: npt.NDArray[np.float64],
-    columns: dict[str, npt.NDArray[np.float64]],
+    plot: dict[str, npt.NDArray[np.float64]],
     names: list[str],
-    order: npt.NDArray[np.intp],
-    breaks: list[float],
-) -> list[tuple[float, bytes]]:
-    """Blocks of consecutive plots; a block ends at every marker, so that file order stays time order."""
-    from asterix import generated
-
-    category = generated.Cat_048_1_32
-    sector = np.searchsorted(np.sort(np.asarray(breaks, np.float64)), time[order], side="right")
-    blocks = []
-    start = 0
-    for stop in range(1, len(order) + 1):
-        if stop == len(order) or stop - start == _PER_BLOCK or sector[stop] != sector[start]:
-            records = [
-                category.cv_record.create(_items(sac, sic, time[k], {c: v[k] for c, v in columns.items()}, names[k]))
-                for k in order[start:stop]
-            ]
-            blocks.append((float(time[order[start]]), category.create(records).unparse().to_bytes()))
-            start = stop
-    return blocks
-
-
-def _items(sac: int, sic: int, time: float, plot: dict[str, float], name: str) -> Any:
-    """Items of one I048 record as raw field values."""
-    address, code, height = int(plot["icao24"]), int(plot["mode3a"]), plot["altitude_m"]
-    ssr = code >= 0 or not np.isnan(height)
-    kind = 5 if address >= 0 else 2 if ssr else 1
-    theta = round(plot["azimuth_rad"] / _AZIMUTH_LSB) % 65536
-    items: dict[str, object] = {
-        "010": (("SAC", sac), ("SIC", sic)),
+    breaks: npt.NDArray[np.float64],
+) -> tuple[list[bytes], npt.NDArray[np.float64]]:
+    """Blocks of consecutive plots, and when each begins; a block ends at every marker: file order is time order."""
+    sector = np.searchsorted(np.sort(breaks), time, side="right")
+    code, height, address = plot["mode3a"].astype(np.int64), plot["altitude_m"], plot["icao24"].astype(np.int64)
+    ground, ssr = plot["on_ground"].astype(np.int64), (code >= 0) | ~np.isnan(height)
+    columns: dict[str, npt.ArrayLike | Column] = {
+        **_source(sac, sic, len(time)),
         "140": _raw_time(time),
-        "020": ((("TYP", kind), 0, 0, 0, 0, None),),
-        "040": (round(plot["range_m"] / _RANGE_LSB), theta),
+        "020/TYP": np.select([address >= 0, ssr], [5, 2], 1),
+        "040/RHO": np.rint(plot["range_m"] / _RANGE_LSB).astype(np.int64),
+        "040/THETA": np.rint(plot["azimuth_rad"] / _AZIMUTH_LSB).astype(np.int64) % 65536,
+        "070/MODE3A": Column(code, code >= 0, None),  # V = G = L = 0: validated, not garbled, from this reply
+        "090/FL": height,
+        "220": Column(address, address >= 0, None),
+        "240": np.array(names, "S8"),
+        "230/COM": Column(np.ones(len(time), np.int64), ground >= 0, None),
+        "230/STAT": Column(ground, ground >= 0, None),
     }
-    if code >= 0:
-        items["070"] = code  # V = G = L = 0: validated, not garbled, from this reply
-    if not np.isnan(height):
-        items["090"] = round(height / _ALTITUDE_LSB) % 16384  # two's complement in 14 bits
-    if address >= 0:
-        items["220"] = address
-    if name.strip():
-        items["240"] = name.ljust(8)
-    if plot["on_ground"] >= 0:
-        # COM = 1, STAT = 1 on ground or 0 airborne, then spare and the Mode S capability bits
-        items["230"] = (1 << 13) | (int(plot["on_ground"]) << 10)
-    return items
+    first = _starts(sector)
+    return _blocks(48, encode(layout(48, editions(48)[-1]), columns), first), time[first]
 
 
-def _raw_time(t: float) -> int:
-    return round((t % _DAY) / _TIME_LSB) % round(_DAY / _TIME_LSB)
+def _starts(sector: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
+    """Index of the first plot of each block: a new sector, or as many plots as a block holds."""
+    new = np.flatnonzero(np.diff(sector, prepend=-1))
+    first = [np.arange(a, b, _PER_BLOCK) for a, b in pairwise([*new.tolist(), len(sector)])]
+    return np.concatenate([np.zeros(0, np.int64), *first]).astype(np.int64)
+
+
+def _source(sac: int, sic: int, n: int) -> dict[str, npt.NDArray[np.int64]]:
+    return {"010/SAC": np.full(n, sac), "010/SIC": np.full(n, sic)}
+
+
+def _blocks(category: int, encoded: Encoded, first: npt.NDArray[np.int64]) -> list[bytes]:
+    data, start = blocks(category, encoded, first)
+    return [data[a:b] for a, b in pairwise(start.tolist())]
+
+
+def _raw_time(time: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    raw: npt.NDArray[np.int64] = np.rint((time % _DAY) / _TIME_LSB).astype(np.int64) % round(_DAY / _TIME_LSB)
+    return raw

@@ -1,33 +1,68 @@
-"""Data blocks of a recording as they are walked, and what the definitions say of one."""
+"""The data blocks of a recording in memory, and what the definitions say of one."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from saltus.framing import Framer, Told, read_chunks
+from saltus.asterix.codec import find_records
+from saltus.asterix.layout import editions, layout
+from saltus.framing import Chunk, Framer, Told, read_chunks
 from saltus.framing.guess import HEAD, guess
 from saltus.framing.twins import scanner
-from saltus.io.layout import Malformed, categories, layout
 
-__all__ = ["Block", "credible", "looks_like_asterix", "read_blocks"]
+__all__ = ["Blocks", "credible", "joined", "looks_like_asterix", "read_blocks"]
 
 
-class Block(NamedTuple):
-    """One data block: its records are `data[3:]`."""
+@dataclass(frozen=True, slots=True)
+class Blocks:
+    """Data blocks over one buffer, as those of `saltus.framing.Chunk`."""
 
-    category: int
-    offset: int  # of the header in the file
-    data: bytes
-    clock: float  # s, UTC or after midnight, when it was recorded; NaN where that is not told
-    cut: bool  # the file ends within it, or its length lies
+    data: npt.NDArray[np.uint8]
+    offset: npt.NDArray[np.int64]
+    length: npt.NDArray[np.int64]
+    category: npt.NDArray[np.uint8]
+    clock: npt.NDArray[np.float64]
+    cut: npt.NDArray[np.bool_]
+    at: npt.NDArray[np.int64]
+    dated: bool  # every clock tells the date
+
+    def __len__(self) -> int:
+        """Number of blocks."""
+        return len(self.offset)
+
+    def take(self, index: npt.NDArray[np.generic]) -> "Blocks":
+        """Select blocks by index or mask."""
+        names = ("offset", "length", "category", "clock", "cut", "at")
+        return replace(self, **{name: getattr(self, name)[index] for name in names})
+
+
+def joined(chunks: Sequence[Chunk]) -> Blocks:
+    """The blocks of all chunks over one buffer."""
+    start = np.cumsum([0, *(len(c.data) for c in chunks)])
+
+    def column(name: str) -> npt.NDArray[np.generic]:
+        return np.concatenate([getattr(c, name) for c in chunks]) if chunks else np.zeros(0)
+
+    offset = [c.offset + s for c, s in zip(chunks, start[:-1], strict=True)]
+    return Blocks(
+        chunks[0].data if len(chunks) == 1 else np.concatenate([c.data for c in chunks] or [np.zeros(0, np.uint8)]),
+        np.concatenate(offset) if offset else np.zeros(0, np.int64),
+        column("length").astype(np.int64),
+        column("category").astype(np.uint8),
+        column("clock").astype(np.float64),
+        column("cut").astype(np.bool_),
+        column("at").astype(np.int64),
+        bool(chunks) and all(c.dated for c in chunks),
+    )
 
 
 def read_blocks(
-    path: Path, framing: str | None, progress: Callable[[str, float], None] | None
-) -> tuple[list[Block], Told, bool]:
+    path: Path, framing: str | None, progress: Callable[[str, float], None] | None = None
+) -> tuple[Blocks, Told]:
     """Cut a file into blocks.
 
     Args:
@@ -36,16 +71,10 @@ def read_blocks(
         progress: called with the file's name and the share read.
 
     Returns:
-        The blocks, what was met, and whether every clock tells the date.
+        The blocks, and what was met.
     """
     framer = Framer(path.name, credible, framing=framing)
-    blocks, dated = [], True
-    for chunk in read_chunks(path, framer, progress=progress):
-        data, dated = chunk.data.tobytes(), dated and chunk.dated
-        columns = chunk.category, chunk.at, chunk.offset, chunk.length, chunk.clock, chunk.cut
-        for category, at, offset, length, clock, cut in zip(*(c.tolist() for c in columns), strict=True):
-            blocks.append(Block(category, at, data[offset : offset + length], clock, cut))
-    return blocks, framer.told, dated
+    return joined(list(read_chunks(path, framer, progress=progress))), framer.told
 
 
 def looks_like_asterix(data: bytes) -> bool:
@@ -60,19 +89,13 @@ def looks_like_asterix(data: bytes) -> bool:
 @lru_cache(1 << 12)
 def credible(category: int, records: bytes) -> bool | None:
     """Whether records all name their source (item 010) and parse in one edition; None: no definition is known."""
-    editions = categories().get(category)
-    if editions is None:
+    known = editions(category)
+    if not known:
         return None
-    return bool(records) and any(_parses(category, edition, records) for edition in reversed(editions))
+    return bool(records) and any(_parses(category, edition, records) for edition in reversed(known))
 
 
 def _parses(category: int, edition: str, records: bytes) -> bool:
-    position = 0
-    try:
-        while position < len(records):
-            _, spans, position = layout(category, edition).walk(records, position, len(records))
-            if "010" not in spans:
-                return False
-    except Malformed:
-        return False
-    return True
+    block = bytes(3) + records
+    found = find_records(block, np.zeros(1, np.int64), np.array([len(block)]), layout(category, edition), strict=True)
+    return not len(found.faults.code)

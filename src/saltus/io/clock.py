@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from saltus.shapes import Float, Int
 
-__all__ = ["DAY", "SORTING_WINDOW", "OrderFaults", "day_offsets", "order_faults"]
+__all__ = ["DAY", "SORTING_WINDOW", "OrderFaults", "complete", "day_offsets", "order_faults"]
 
 DAY = 86400.0  # s
 SORTING_WINDOW = 2.0  # s: radars send sector by sector, multi-channel receivers a little late
@@ -25,6 +25,32 @@ class OrderFaults(NamedTuple):
     late: npt.NDArray[np.bool_]  # older than the newest by more than the sorting window
     jump: npt.NDArray[np.bool_]  # a wild time, or one the clock repeated after it was set back
     steps: tuple[int, ...]  # indices at which the clock stepped back for good
+
+
+def complete(
+    truncated: Float[np.ndarray, " n"], modulus: float, near: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """Complete times of day that are given modulo a time that does not divide the day.
+
+    Of the times of day t with t mod modulus = truncated, the one nearest to `near` on the circle of the day: candidates
+    are the nearest on this day, the day before and the day after, where truncation starts again at midnight.
+
+    Args:
+        truncated: (N,) s, NaN = not given.
+        modulus: s.
+        near: (N,) s after midnight, within half a modulus; NaN = unknown.
+
+    Returns:
+        s after midnight, (N,), NaN where either is NaN.
+    """
+    best, distance = np.full(len(truncated), np.nan), np.full(len(truncated), np.inf)
+    for day in (0.0, -DAY, DAY):
+        reference = near - day
+        time = truncated + modulus * np.round((reference - truncated) / modulus)
+        time = np.where(time < 0, time + modulus, np.where(time >= DAY, time - modulus, time))
+        closer = np.abs(time - reference) < distance
+        best, distance = np.where(closer, time, best), np.where(closer, np.abs(time - reference), distance)
+    return best
 
 
 def day_offsets(time_of_day: npt.ArrayLike) -> Int[np.ndarray, " n"]:

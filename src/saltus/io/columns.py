@@ -8,11 +8,13 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.io.layout import Layout
+from saltus.asterix.codec import Column, Data, Records, Want, decode
+from saltus.asterix.layout import SI, Layout
 from saltus.records import REASONS, Traits
 
-__all__ = ["Category", "Columns", "Decoded", "first_reason", "icao_text", "validated"]
+__all__ = ["SOURCE", "Category", "Columns", "Decoded", "first_reason", "read_columns", "status", "validated"]
 
+SOURCE = "010"  # the item that names the source, in every category
 Numbers = npt.NDArray[np.float64]
 Codes = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
@@ -30,94 +32,91 @@ class Decoded(NamedTuple):
     new_cycle: Mask  # north markers and starts of an update cycle
     steps: Mapping[str, float]  # quantisation: fields of Source
     tracks: pa.Table | None = None  # columns of another system's tracks, one row for each record
+    time_modulus: float = 0.0  # s: times of day are given modulo this; 0 = whole
 
 
 @dataclass(frozen=True, slots=True)
 class Category:
     """What to take from the records of one category, and how to read it.
 
-    `items` are kept as bytes while the file is walked; `decode` turns them into arrays. `plausible` says how well
-    the numbers hang together (0 to 1): it decides between editions whose definitions both parse. `traits` are those
-    of every source of the category; that one rotates is told by its reports.
+    `fields` are the paths taken (those that an edition does not have stay absent); `decode` makes sense of them.
+    `plausible` says how well the numbers hang together (0 to 1): it decides between editions whose definitions both
+    parse. `traits` are those of every source of the category; that one rotates is told by its reports. `turns` is the
+    category of the service messages that tell the update cycle of its sources.
     """
 
     number: int
-    items: tuple[str, ...]
+    fields: tuple[str | Want, ...]
     decode: Callable[["Columns"], Decoded]
     plausible: Callable[["Columns"], float] | None = None
     traits: Traits = Traits()
+    turns: int | None = None
+    counted: bool = False  # no target reports are taken
 
 
 class Columns:
-    """Items of N records: absent ones are NaN, `absent` or empty."""
+    """Fields of N records by path: absent ones are NaN, `absent` or empty."""
 
-    def __init__(self, layout: Layout, n: int, items: Mapping[str, tuple[list[int], list[bytes]]]) -> None:
+    def __init__(self, layout: Layout, n: int, held: Mapping[str, Column]) -> None:
         self.layout = layout
         self.n = n
-        self.items = items
-        self._words: dict[str, tuple[npt.NDArray[np.intp], npt.NDArray[np.uint64]]] = {}
+        self._held = held
 
-    def defines(self, item: str) -> bool:
-        """Whether this edition has the item at all."""
-        return item in self.layout.names
+    def defines(self, path: str) -> bool:
+        """Whether this edition has the field at all."""
+        return path in self._held
 
-    def has(self, item: str) -> Mask:
-        """Whether each record carries the item, (N,)."""
-        present = np.zeros(self.n, np.bool_)
-        present[self._word(item)[0]] = True
-        return present
+    def has(self, path: str) -> Mask:
+        """Whether each record carries the field, (N,)."""
+        column = self._held.get(path)
+        return np.zeros(self.n, np.bool_) if column is None or column.present is None else column.present
 
-    def number(self, item: str, name: str | None = None, *, signed: bool | None = None) -> Numbers:
+    def number(self, path: str) -> Numbers:
         """A quantity in SI units and radians, (N,), NaN where absent."""
-        values = np.full(self.n, np.nan)
-        if self.defines(item):
-            field = self.layout.field(item, name, signed=signed)
-            index, words = self._word(item)
-            values[index] = field.raw(words) * field.lsb
-        return values
+        column = self._held.get(path)
+        return np.full(self.n, np.nan) if column is None else column.values
 
-    def code(self, item: str, name: str | None = None, *, absent: int = -1) -> Codes:
-        """A coded value, (N,). Parts of an extended item that were not sent read 0, as the standard has it."""
-        values = np.full(self.n, absent, np.int64)
-        if self.defines(item):
-            index, words = self._word(item)
-            values[index] = self.layout.field(item, name).raw(words)
-        return values
+    def code(self, path: str, *, beside: str | None = None) -> Codes:
+        """A coded value, (N,), -1 where absent.
 
-    def text(self, item: str, name: str | None = None) -> Texts:
-        """A name of 8 characters of 6 bits (ICAO Annex 10 vol. IV, 3.1.2.9.1.2), (N,), without blanks around it."""
-        values = np.full(self.n, "", "U8")
-        if self.defines(item):
-            index, words = self._word(item)
-            values[index] = icao_text(self.layout.field(item, name).raw(words))
-        return values
+        Parts of an extended item that were not sent read 0, as the standard has it: where the field `beside`, of the
+        item's first part, is there.
+        """
+        column = self._held.get(path)
+        values = np.full(self.n, -1, np.int64) if column is None else column.values
+        if beside is None or column is None:
+            return values
+        return np.where((values < 0) & self.has(beside), 0, values)
 
-    def _word(self, item: str) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.uint64]]:
-        """Records that carry an item, and its first 8 bytes, left-aligned."""
-        found = self._words.get(item)
-        if found is None:
-            index, chunks = self.items.get(item, ([], []))
-            joined = b"".join(chunk[:8].ljust(8, b"\0") for chunk in chunks)
-            found = np.array(index, np.intp), np.frombuffer(joined, ">u8").astype(np.uint64)
-            self._words[item] = found
-        return found
+    def text(self, path: str) -> Texts:
+        """A text without blanks around it, (N,)."""
+        column = self._held.get(path)
+        return np.full(self.n, "", "U8") if column is None else column.values.astype("U8")
+
+    def spans(self, item: str) -> npt.NDArray[np.int64]:
+        """Where an item starts and stops in the buffer, (N, 2)."""
+        return self._held[item].values
+
+    def step(self, path: str) -> float:
+        """Least significant bit of a quantity, SI units."""
+        field = self.layout.field(path)
+        return field.lsb * SI.get(field.unit, 1.0)
+
+    def labels(self, path: str) -> Mapping[int, str]:
+        """What the values of a coded field mean; nothing where this edition does not have it."""
+        return self.layout.labels(path) if self.layout.has(path) else {}
 
 
-def icao_text(codes: Codes) -> Texts:
-    """Spell 48-bit names: A to Z are 1 to 26, digits 48 to 57, blank 32; other values stand for nothing."""
-    letters = np.full(64, "", "U1")
-    letters[1:27] = [chr(ord("A") + k) for k in range(26)]
-    letters[48:58] = [str(k) for k in range(10)]
-    letters[32] = " "
-    name = np.full(len(codes), "", "U8")
-    for shift in range(42, -1, -6):
-        name = np.char.add(name, letters[(codes >> shift) & 63])
-    return np.char.strip(name).astype("U8")
+def read_columns(data: Data, records: Records, layout: Layout, fields: tuple[str | Want, ...]) -> Columns:
+    """Take the fields that this edition has."""
+    wants = {w.path: w for w in (Want(f) if isinstance(f, str) else f for f in fields) if w.path in layout.fields}
+    held = decode(data, records, layout, {**wants, SOURCE: Want(SOURCE, "span")})
+    return Columns(layout, len(records.start), held)
 
 
 def validated(columns: Columns, item: str) -> Mask:
     """Codes that the sensor calls neither unvalidated (V) nor garbled (G), (N,)."""
-    valid: Mask = (columns.code(item, "V") == 0) & (columns.code(item, "G") == 0)
+    valid: Mask = (columns.code(f"{item}/V") == 0) & (columns.code(f"{item}/G") == 0)
     return valid
 
 
@@ -127,3 +126,17 @@ def first_reason(n: int, cases: Mapping[str, Mask]) -> npt.NDArray[np.int8]:
     for text, holds in reversed(list(cases.items())):
         reason[holds] = REASONS.index(text)
     return reason
+
+
+def status(c: Columns, time: str, message: str = "", cycle: int = -1) -> Decoded:
+    """Records that are no target reports: their time, the type of message, and which of them starts a cycle."""
+    kinds = c.code(message)
+    return Decoded(
+        time_of_day=c.number(time),
+        is_report=np.zeros(c.n, np.bool_),
+        types=kinds,
+        labels=c.labels(message),
+        columns={},
+        new_cycle=kinds == cycle if cycle >= 0 else np.zeros(c.n, np.bool_),
+        steps={},
+    )

@@ -27,46 +27,49 @@ from saltus.records import Kind, Traits
 
 __all__ = ["CAT010"]
 
-_ITEMS = ("010", "000", "020", "140", "040", "042", "041", "060", "090", "220", "245", "161")
+_FIELDS = tuple(
+    "000 020/TYP 020/SIM 020/TST 020/RAB 020/GBS 020/TOT 140 040/RHO 040/TH 042/X 042/Y 041/LAT 041/LON "
+    "060/V 060/G 060/L 060/MODE3A 090/V 090/G 090/FL 220 245/CHR 161/TRK".split()
+)
 _MODE_S, _ADS_B = 1, 2  # I010/020 TYP
 _VEHICLE = 2  # I010/020 TOT
 _STATUS = 100  # added to message types to keep them apart from detection types
 
 
 def _decode(c: Columns) -> Decoded:
-    message, kind = c.code("000"), c.code("020", "TYP")
+    message, kind = c.code("000"), c.code("020/TYP")
     is_report = (message == 1) | ((message == -1) & (kind >= 0))
-    labels = {_STATUS + k: text for k, text in c.layout.labels("000").items()}
-    ground = (c.code("020", "GBS") == 1) | (c.code("020", "TOT") == _VEHICLE)
-    position = [c.has("040"), c.has("042"), c.has("041")]
-    code = np.where(validated(c, "060") & (c.code("060", "L") == 0), c.code("060", "MODE3A"), -1)
+    labels = {_STATUS + k: text for k, text in c.labels("000").items()}
+    ground = (c.code("020/GBS") == 1) | (c.code("020/TOT") == _VEHICLE)
+    position = [c.has("040/RHO"), c.has("042/X"), c.has("041/LAT")]
+    code = np.where(validated(c, "060") & (c.code("060/L") == 0), c.code("060/MODE3A"), -1)
     reason = first_reason(
         c.n,
         {
-            "simulated": c.code("020", "SIM") == 1,
-            "test target": c.code("020", "TST") == 1,
-            "field monitor": c.code("020", "RAB") == 1,
+            "simulated": c.code("020/SIM") == 1,
+            "test target": c.code("020/TST") == 1,
+            "field monitor": c.code("020/RAB") == 1,
         },
     )
     return Decoded(
         time_of_day=c.number("140"),
         is_report=is_report,
         types=np.where(is_report, kind, np.where(message >= 0, _STATUS + message, -1)),
-        labels={**c.layout.labels("020", "TYP"), **labels},
+        labels={**c.labels("020/TYP"), **labels},
         columns={
             "kind": np.select(position, [Kind.POLAR, Kind.PLANE, Kind.GEODETIC], Kind.NONE),
-            "range": c.number("040", "RHO"),
-            "azimuth": c.number("040", "TH"),
-            "x": c.number("042", "X"),
-            "y": c.number("042", "Y"),
-            "latitude": c.number("041", "LAT"),
-            "longitude": c.number("041", "LON"),
-            "altitude": np.where(validated(c, "090"), c.number("090", "FL"), np.nan),
+            "range": c.number("040/RHO"),
+            "azimuth": c.number("040/TH"),
+            "x": c.number("042/X"),
+            "y": c.number("042/Y"),
+            "latitude": c.number("041/LAT"),
+            "longitude": c.number("041/LON"),
+            "altitude": np.where(validated(c, "090"), c.number("090/FL"), np.nan),
             "icao24": c.code("220"),
             "mode3a": code,
-            "callsign": c.text("245", "CHR"),
+            "callsign": c.text("245/CHR"),
             "on_ground": np.select([ground, (kind == _MODE_S) | (kind == _ADS_B)], [1, 0], -1),
-            "local_id": c.code("161", "TRK"),
+            "local_id": c.code("161/TRK"),
             "reason": reason,
         },
         new_cycle=message == 2,
@@ -80,4 +83,4 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT010 = Category(10, _ITEMS, _decode, traits=Traits(surface=True))
+CAT010 = Category(10, _FIELDS, _decode, traits=Traits(surface=True))
