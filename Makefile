@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 NATIVE := CMakeLists.txt $(wildcard native/*)
 DOCS_READY := $(VENV)/.docs-ready
 
-.PHONY: demo test crash check format docs wheel bench sanitize clean
+.PHONY: demo test crash check format docs wheel bench bench-asterix sanitize clean
 
 demo: $(READY)
 	$(BIN)/saltus demo -o out/demo
@@ -44,6 +44,12 @@ bench:
 	build/bench/bin/python -m pip install -q '.[bench]'
 	build/bench/bin/python benchmarks/filter_speed.py -o benchmarks/results.json
 
+# asterix_decoder is GPL and calls its module as libasterix does: it runs in an environment of its own.
+bench-asterix: $(READY)
+	$(PYTHON) -m venv build/bench-asterix
+	build/bench-asterix/bin/python -m pip install -q asterix_decoder==0.7.11
+	$(BIN)/python benchmarks/asterix_speed.py --peer build/bench-asterix/bin/python
+
 # The compiled kernel under the address and undefined-behaviour sanitizers, in an environment that borrows the tools
 # of .venv. Python itself leaks at exit, so leaks are not looked for.
 sanitize: $(READY)
@@ -53,7 +59,7 @@ sanitize: $(READY)
 	LD_PRELOAD="$$($${CXX:-g++} -print-file-name=libasan.so) $$($${CXX:-g++} -print-file-name=libstdc++.so)" \
 	  ASAN_OPTIONS=detect_leaks=0 SALTUS_REQUIRE_NATIVE=1 \
 	  PYTHONPATH="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" \
-	  build/sanitize/bin/python -m pytest tests/native tests/filters/test_imm.py tests/filters/test_bank.py \
+	  build/sanitize/bin/python -m pytest tests/native tests/asterix tests/filters/test_imm.py tests/filters/test_bank.py \
 	  tests/filters/test_coloured.py
 
 $(READY): pyproject.toml $(NATIVE)

@@ -70,7 +70,7 @@ def draw() -> str:
         _text(middle, _TOP - 20, "saltus", size=17, fill="#fff", extra='font-weight="700"'),
         *(_floor(names, _TOP + k * _FLOOR) for k, names in enumerate(floors)),
         f'<rect x="{_LEFT - 26}" y="{ground}" width="{_WIDTH + 52}" height="12" fill="{_INK}"/>',
-        _text(middle, ground + 34, "numpy, scipy, pyarrow, pyproj, libasterix", size=12.5, fill=_GREY),
+        _text(middle, ground + 34, "numpy, scipy, pyarrow, pyproj", size=12.5, fill=_GREY),
         f'<line x1="{arrow}" y1="{_TOP + 8}" x2="{arrow}" y2="{ground - 4}" stroke="{_INK}" stroke-width="1.6" '
         'marker-end="url(#down)"/>',
         f'<g transform="translate({arrow - 14} {(_TOP + ground) / 2}) rotate(-90)">',

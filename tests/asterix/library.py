@@ -2,6 +2,7 @@
 
 import random
 
+import numpy as np
 from asterix import base, generated
 
 from saltus.asterix.layout import SI
@@ -125,3 +126,14 @@ def value(raw, size, content):
         text = content.cv_string_type.to_string(size, raw)
         return text.replace("\0", "").strip(" ").encode("latin-1")
     return raw
+
+
+def in_blocks(category, octets):
+    """Records in data blocks of up to three: the bytes, where each block starts, and its length."""
+    data, offset, length = b"", [], []
+    for k in range(0, len(octets), 3):
+        body = b"".join(octets[k : k + 3])
+        offset.append(len(data))
+        data += bytes([category]) + (len(body) + 3).to_bytes(2, "big") + body
+        length.append(len(body) + 3)
+    return data, np.array(offset), np.array(length)

@@ -4,7 +4,7 @@ import random
 
 import numpy as np
 import pytest
-from library import Draw, definitions, value
+from library import Draw, definitions, in_blocks, value
 
 from saltus.asterix.codec import Column, Want, decode, find_records
 from saltus.asterix.encode import blocks, encode
@@ -27,16 +27,6 @@ def drawn(category, edition, profile, record, n):
         octets.append(draw.record(record, profile))
         held.append(draw.fields)
     return octets, held
-
-
-def in_blocks(category, octets):
-    data, offset, length = b"", [], []
-    for k in range(0, len(octets), 3):
-        body = b"".join(octets[k : k + 3])
-        offset.append(len(data))
-        data += bytes([category]) + (len(body) + 3).to_bytes(2, "big") + body
-        length.append(len(body) + 3)
-    return data, np.array(offset), np.array(length)
 
 
 def equal(got, expected):

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from frames import NORTH, PLOT, plot
 
+from saltus.asterix.layout import categories, editions, layout
 from saltus.errors import DataError
 from saltus.io import read
 from saltus.io.asterix_write import write_cat048
-from saltus.records import REASONS, Kind, Traits
+from saltus.io.categories import CATEGORIES
+from saltus.records import REASONS, Datum, Kind, Traits
 
 DAY = datetime.date(2024, 5, 1)
 MIDNIGHT = datetime.datetime(2024, 5, 1, tzinfo=datetime.UTC).timestamp()
@@ -200,3 +202,107 @@ def test_round_trip_of_simulated_plots(tmp_path, rng):
     np.testing.assert_array_equal(p.callsign, truth["callsign"])
     np.testing.assert_array_equal(p.on_ground, truth["on_ground"])
     assert {c.system.category: round(c.update_period, 6) for c in got.contents} == {34: 4.0, 48: 4.0}
+
+
+def test_old_radar_is_dated_by_its_service_messages(tmp_path):
+    """I001/141 counts modulo 512 s: 28801 s are 56 x 512 + 129, and 129 x 128 = 16512 = 4080."""
+    # CAT002 FSPEC d0: 010 000 - 030; 28800 s x 128 = 3686400 = 384000
+    north = block(2, "d0 1402 01 384000")
+    # CAT001 FSPEC fa: 010 020 040 070 090 - 141
+    secondary = "20"  # TYP 0 plot, SSRPSR 2 in bits 6-5
+    report = f"fa 1402 {secondary} 0500 4000 029c 0190 4080"
+    got = load(tmp_path, north, block(1, report), north)
+    p = got.plots
+    assert got.problems == ()
+    assert reasons(got) == [""]
+    assert p.time[0] == MIDNIGHT + 28801.0
+    assert p.range[0] == 0x500 * 1852 / 128  # 10 NM
+    assert p.azimuth[0] == pytest.approx(np.pi / 2, rel=1e-15)
+    assert p.altitude[0] == pytest.approx(3048.0)
+    assert (p.mode3a[0], p.kind[0]) == (0o1234, Kind.POLAR)
+    assert p.sources[0].traits == Traits(rotating=True)
+    assert got.contents[0].n_by_type == {"Sole secondary detection": 1}
+
+
+def test_old_radar_without_a_clock_has_no_time(tmp_path):
+    got = load(tmp_path, block(1, "fa 1402 20 0500 4000 029c 0190 4080"))
+    assert reasons(got) == ["no time"]
+    assert "tell their time modulo 512 s only" in got.problems[0]
+
+
+def test_plots_and_tracks_of_an_old_radar_in_one_block(tmp_path):
+    """The second octet of a track's FSPEC is laid out otherwise: TYP (the high bit of 020) says which it is."""
+    north = block(2, "d0 1402 01 384000")
+    plot = "fa 1402 20 0500 4000 029c 0190 4080"
+    # FSPEC e9 40 of a track: 010 020 161 - 042 - - | - 141; 161 is 7; X = 64/64 NM, Y = -64/64 NM
+    track = "e9 40 1402 a0 0007 0040 ffc0 4080"
+    got = load(tmp_path, north, block(1, plot + track + plot))
+    p = got.plots
+    assert p.kind.tolist() == [Kind.POLAR, Kind.PLANE, Kind.POLAR]
+    assert reasons(got) == ["", "system track", "duplicate"]
+    assert (p.x[1], p.y[1], p.local_id[1]) == (1852.0, -1852.0, 7)
+
+
+def test_multilateration(tmp_path):
+    # FSPEC ff 0f 08: 010 020 140 041 042 161 170 | - - - - 220 245 110 | - - - - 500 - -
+    # 40 degrees are 7456540 = 71c71c steps of 180/2^25; X = 100 m = 200 steps = c8
+    head = "ff 0f 08 1401"
+    # 020: 41 is MS, extended; GBS is 10 in the extension
+    body = (
+        f"{head} 41 10 003240 0071c71c 00000000 0000c8 ffff38 0007 00 3c6444 00 10c231820820 0010 "
+        "40 0008 0008 0000"  # 500: SDP, 2 m and 2 m
+    )
+    got = load(tmp_path, block(20, body))
+    p = got.plots
+    assert reasons(got) == [""]
+    assert np.degrees(p.latitude[0]) == pytest.approx(40.0, abs=1e-5)
+    assert (p.x[0], p.y[0], p.kind[0]) == (100.0, -100.0, Kind.GEODETIC)
+    assert p.z[0] == pytest.approx(16 * 6.25 * 0.3048)
+    assert p.sigma[0] == pytest.approx(2.0)
+    assert (p.icao24[0], p.callsign[0], p.on_ground[0], p.local_id[0]) == (0x3C6444, "DLH1", 1, 7)
+    assert got.contents[0].n_by_type == {"Mode S multilateration": 1}
+
+
+def test_surface_guidance_tracks_are_another_systems(tmp_path):
+    # FSPEC d9 0d 10: 010 000 - 140 041 - - | - - - - 161 170 - | - - - 092; 40 degrees are 1c71c71c steps of 180/2^31
+    # 092: 400 steps of 6.25 ft
+    body = "d9 0d 10 0007 01 003240 1c71c71c 00000000 0005 00 0190"
+    got = load(tmp_path, block(11, body))
+    p = got.plots
+    assert reasons(got) == ["system track"]
+    assert np.degrees(p.latitude[0]) == pytest.approx(40.0, abs=1e-5)
+    assert p.height[0] == pytest.approx(400 * 6.25 * 0.3048)
+    assert p.datum[0] == Datum.MEAN_SEA_LEVEL
+    assert got.tracks["track_number"].to_pylist() == [5]
+    assert got.tracks["system"].to_pylist() == ["CAT011:0/7"]
+
+
+@pytest.mark.parametrize(
+    ("version", "quality", "sigma", "containment"),
+    [
+        # 090: NUCr 0, NUCp or NIC 8 (10 hexadecimal, and FX), then NICbaro, SIL, NACp 8 (10)
+        (2, "11 10", 92.6 / 2.45, 185.2),  # NACp 8: 0.05 NM; NIC 8: 0.1 NM
+        (0, "11 10", np.nan, 25.0),  # version 0 knows no NACp; NUCp 8: 25 m
+        (2, "10", np.nan, 185.2),
+        (2, "11 11 01 b0", 92.6 / 2.45, 185.2),  # PIC 11: 0.1 NM
+        (2, "11 11 01 d0", 92.6 / 2.45, 0.013 * 1852),  # PIC 13 goes before NIC
+    ],
+)
+def test_adsb_quality_by_version(tmp_path, version, quality, sigma, containment):
+    # FSPEC c5 19 30: 010 040 - - - 130 - | - - - 080 073 - - | - - 090 210
+    body = f"c5 19 30 14db 00 1c71c7000000 abcdef 003240 {quality} {version << 3:02x}"
+    got = load(tmp_path, block(21, body), editions={21: "2.1"})
+    assert got.problems == ()
+    assert got.plots.sigma[0] == pytest.approx(sigma, nan_ok=True)
+    assert got.plots.containment[0] == pytest.approx(containment)
+
+
+def test_every_category_of_the_layouts_has_its_line():
+    assert set(CATEGORIES) == set(categories())
+    for category in CATEGORIES.values():
+        newest = layout(category.number, editions(category.number)[-1])
+        for field in category.fields:
+            path = field if isinstance(field, str) else field.path
+            known = any(path in layout(category.number, e).fields for e in editions(category.number))
+            assert known or not path, (category.number, path)
+        assert newest.has("010")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from saltus.io.clock import day_offsets, order_faults
+from saltus.io.clock import DAY, complete, day_offsets, order_faults
 
 
 def test_midnight_counts_on():
@@ -108,3 +108,18 @@ def test_a_passing_leap_ahead_is_dropped():
     late, jump, steps = order_faults(time)
     assert np.flatnonzero(jump).tolist() == list(range(60, 90))
     assert not late.any() and steps == ()
+
+
+def test_truncated_times_are_completed_by_one_near_them():
+    """512 s do not divide the day: 86400 = 168 x 512 + 384, and truncation starts again at 0 after midnight."""
+    told = np.array([100.0, 100.0, 383.0, 1.0, 1.0, 383.0, np.nan, 5.0])
+    near = np.array([600.0, 700.0, 86399.0, 86399.0, 2.0, 2.0, 50.0, np.nan])
+    expected = [612.0, 612.0, 86399.0, 1.0, 1.0, 86399.0, np.nan, np.nan]
+    np.testing.assert_array_equal(complete(told, 512.0, near), expected)
+
+
+def test_every_truncated_time_of_two_days_is_found_within_half_a_turn(rng):
+    time = rng.uniform(0.0, 2 * DAY, 5000)
+    # the last turn of a day has 384 s: times within half of them are told apart
+    near = (time + rng.uniform(-180.0, 180.0, 5000)) % DAY
+    np.testing.assert_allclose(complete(time % DAY % 512.0, 512.0, near), time % DAY, atol=1e-6)
