@@ -5,7 +5,7 @@ import pytest
 
 from diffusions import unchecked
 from saltus import ModelError
-from saltus.filters.particles import effective_size, generator, group_error, merged, systematic
+from saltus.filters.particles import effective_size, generator, group_error, merged, stated_error, systematic, thinned
 
 
 def test_systematic_resampling_takes_each_particle_as_often_as_it_weighs(rng):
@@ -28,6 +28,51 @@ def test_one_particle_with_all_the_weight_is_all_there_is(rng):
     assert (systematic(weights, rng) == 4).all()
     assert effective_size(weights * 1e300) == 1.0
     assert effective_size(np.ones((3, 7))).tolist() == [7.0] * 3
+
+
+def test_thinning_keeps_the_heavy_and_expectations(rng):
+    k, n = 40, 12
+    log_w = 6.0 * rng.normal(size=(3, k))
+    w = np.exp(log_w - log_w.max(1, keepdims=True))
+    total, squares, heavy = np.zeros_like(w), np.zeros_like(w), np.argsort(-w, axis=1)[:, :3]
+    for _ in range(4000):
+        chosen, kept = thinned(log_w, n, rng)
+        assert (np.diff(chosen, axis=1) > 0).all()  # n different ones, in order
+        np.testing.assert_allclose(np.exp(kept - log_w.max(1, keepdims=True)).sum(1), w.sum(1), rtol=1e-10)
+        now = np.zeros_like(w)
+        np.put_along_axis(now, chosen, np.exp(kept - log_w.max(1, keepdims=True)), 1)
+        assert (np.take_along_axis(now, heavy, 1) == np.take_along_axis(w, heavy, 1)).all()
+        total, squares = total + now, squares + now**2
+    mean, sd = total / 4000, np.sqrt(np.maximum(squares / 4000 - (total / 4000) ** 2, 0.0))
+    drawn = sd > 0
+    assert (np.abs(mean - w)[drawn] < 5 * sd[drawn] / np.sqrt(4000)).all() and drawn.any()
+    # What is never drawn in 4000 times has a chance below 1e-3: w / c, c the least weight of those kept.
+    assert (w[~drawn & (mean == 0)] < 5e-3 * np.exp(kept - log_w.max(1, keepdims=True)).min()).all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e5])
+def test_thinning_of_weights_that_no_number_holds(rng, scale):
+    log_w = -scale * np.arange(30.0)[None] ** 2
+    log_w[:, ::7] = -np.inf
+    chosen, kept = thinned(rng.permutation(log_w, axis=1), 10, rng)
+    assert len(set(chosen[0])) == 10 and np.isfinite(kept).all()
+    few, rest = thinned(np.array([[0.0, -np.inf, -1e9, -2e300]]), 6, rng)
+    assert sorted(few[0][np.isfinite(rest[0])]) == [0, 2, 3] and np.isfinite(rest).sum() == 3
+    np.testing.assert_array_equal(np.sort(rest[0]), [-np.inf, -np.inf, -np.inf, -2e300, -1e9, 0.0])
+
+
+def test_equal_weights_are_thinned_evenly(rng):
+    chosen, kept = thinned(np.zeros((2, 30)), 10, rng)
+    np.testing.assert_allclose(kept, np.log(3.0))
+    assert (np.diff(chosen, axis=1) == 3).all()  # systematic
+
+
+def test_nothing_is_claimed_after_what_no_mode_explains():
+    d2, n = np.array([[1.0, 40.0, 0.0, 1.0], [1.0, 2.0, 25.0, 0.0]]), np.ones((2, 4))
+    error, findings = stated_error(np.full((2, 4), 0.1), d2, n, n > 0)
+    np.testing.assert_array_equal(error, [[0.1, np.inf, np.inf, np.inf], [0.1] * 4])
+    assert [f.kind for f in findings] == ["unexplained"] and findings[0].where == "row 1 of run 0"
+    assert stated_error(np.zeros((2, 4)), d2, n, n < 0)[1] == ()  # nothing was left to chance
 
 
 def test_merging_keeps_weight_mean_and_covariance(rng):

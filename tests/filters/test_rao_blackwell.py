@@ -36,10 +36,49 @@ def test_stated_error_covers_the_exact_mean(fusion):
     z, exact = fusion
     est = particle_filter(z, **FUSION, n_particles=800, rng=np.random.default_rng(0))
     off = distances(est, exact)
+    # The eight modes of the first row are fewer than the hundred particles of a group.
+    assert (est.error[:, 0] == 0).all() and off[:, 0].max() < 1e-9
+    off, stated = off[:, 1:], est.error[:, 1:]
     # 95 % of rows, less 5 standard errors of 30 independent runs whose rows may go together.
-    assert np.mean(off <= est.error) > 0.95 - 5 * np.sqrt(0.95 * 0.05 / 30) * 0.5
-    assert np.mean(3 * off <= est.error) < 0.9  # and it does not cover by being far too wide
+    assert np.mean(off <= stated) > 0.95 - 5 * np.sqrt(0.95 * 0.05 / 30) * 0.5
+    assert np.mean(3 * off <= stated) < 0.9  # and it does not cover by being far too wide
+    assert est.findings == ()
     assert ((0 < est.effective) & (est.effective <= 1 + 1e-12)).all()
+
+
+OUTLIERS = dict(R=np.array([[[1.0]], [[100.0]]]), trans=[[[0.9, 0.1], [0.9, 0.1]]], probs0=[0.9, 0.1])
+DRIFT = dict(b=np.array([[-1.0], [1.0]]), R=[[[4.0]]], Q=[[[0.1]]], trans=[[[0.95, 0.05], [0.05, 0.95]]])
+BIASED = dict(d=np.array([[0.0], [6.0]]), trans=[[[0.95, 0.05], [0.2, 0.8]]])
+PLAIN = dict(F=[[[1.0]]], Q=[[[1.0]]], H=[[[1.0]]], R=[[[1.0]]], mean0=[0.0], cov0=[[1.0]], probs0=[0.5, 0.5])
+
+
+@pytest.mark.parametrize("model", [OUTLIERS, DRIFT, BIASED])
+@pytest.mark.parametrize("n_particles", [300, 3000])
+def test_stated_error_covers_the_exact_mean_of_data_the_model_hardly_makes(model, n_particles):
+    """Noise of many sigmas, a step, a spike: nothing is claimed, or what is claimed holds."""
+    arrays, rng = PLAIN | model, np.random.default_rng(8)
+    likely = simulate_hybrid(**arrays, n_steps=10, batch=20, rng=rng).z
+    spike, step = likely.copy(), likely.copy()
+    spike[:, 5] += 60.0 * rng.choice([-1, 1], size=(20, 1))
+    step[:, 5:] += 60.0 * rng.choice([-1, 1], size=(20, 1, 1))
+    z = np.concatenate([likely, spike, step, 40.0 * rng.normal(size=(40, 10, 1))])
+    exact, est = exact_filter(z, **arrays), particle_filter(z, **arrays, n_particles=n_particles, rng=rng)
+    off, claimed = distances(est, exact), np.isfinite(est.error)
+    inside = off <= est.error + 1e-9
+    assert claimed[:20].all() and inside[:20].mean() > 0.9
+    # Where a claim is left, it is kept, or missed by no more than a tenth of a standard deviation.
+    assert inside[claimed].mean() > 0.93 and (off - est.error)[claimed].max() < 0.1
+    if n_particles == 3000:  # 375 in a group keep most of the thousand histories
+        assert off.max() < 0.3
+    assert {f.kind for f in est.findings} <= {"unexplained"} and bool(est.findings) == (not claimed.all())
+
+
+def test_histories_that_fit_are_all_there(rng):
+    p = problem(rng, n_steps=5, batch=(3,), sizes=(2,))
+    exact, est = exact_filter(**p), particle_filter(**p, n_particles=128, groups=2, rng=rng)
+    assert (est.error == 0).all() and est.findings == ()
+    for name in ("mean", "cov", "probs", "log_likelihood", "nis"):
+        assert error(getattr(est, name), getattr(exact, name)) < 1e-9, name
 
 
 def test_more_particles_are_closer(fusion):

@@ -19,7 +19,7 @@ from saltus.filters import steps
 from saltus.filters.estimates import Estimates
 from saltus.filters.flat import Flat
 from saltus.filters.observation import impossible, innovation_nis
-from saltus.filters.particles import effective_size, group_error, systematic
+from saltus.filters.particles import effective_size, group_error, stated_error, systematic
 from saltus.linalg import normalised, symmetric
 from saltus.models import DiffusionSensor, SwitchingSDE
 from saltus.simulate import advance
@@ -56,6 +56,7 @@ class _Row(NamedTuple):
     log_likelihood: _Array
     nis: _Array
     effective: _Array
+    nearest: _Array
 
 
 def diffusion_moves(model: SwitchingSDE, dts: _Array, substeps: int) -> Moves:
@@ -139,7 +140,7 @@ def bootstrap(
     for k in range(z.shape[1]):
         seen = np.repeat(z[:, k], groups, axis=0)
         moved = _moved(cloud, moves, k, rng)
-        nis = _nis(moved, moves.n_modes, sensor, z[:, k], dts[k])
+        nis, nearest = _distances(moved, moves.n_modes, sensor, z[:, k], dts[k])
         before = None
         if auxiliary:  # the innovation is that of all, the update that of those drawn
             drawn, before = _drawn_ahead(cloud, moves, sensor, k, z, dts[k], rng)
@@ -151,10 +152,13 @@ def bootstrap(
         evidence = log_f[:, 0] + (0.0 if before is None else before.log_f)
         told = log_group + evidence.reshape(B, groups)
         told, total = normalised(told, (1,))
-        rows.append(_row(cloud, moves.n_modes, told, total[:, 0], nis))
+        rows.append(_row(cloud, moves.n_modes, told, total[:, 0], nis, nearest))
         log_group, _ = normalised(_REMEMBERED * told, (1,))
         cloud = _drawn_anew(cloud, rng)
     stacked = _Row(*(np.stack(parts, axis=1) for parts in zip(*rows, strict=True)))
+    n_observed = (~np.isnan(z)).sum(-1).astype(float)
+    spread, by_chance = group_error(stacked.group_means, stacked.cov), np.ones(n_observed.shape, bool)
+    error, findings = stated_error(spread, stacked.nearest, n_observed, by_chance)
     return Estimates(
         probs=stacked.probs,
         mean=stacked.mean,
@@ -162,9 +166,10 @@ def bootstrap(
         log_likelihood=stacked.log_likelihood,
         log_likelihood_start=np.zeros(B),
         nis=stacked.nis,
-        n_observed=(~np.isnan(z)).sum(-1).astype(float),
-        error=group_error(stacked.group_means, stacked.cov),
+        n_observed=n_observed,
+        error=error,
         effective=stacked.effective,
+        findings=findings,
     )
 
 
@@ -239,7 +244,7 @@ def _drawn_anew(cloud: _Cloud, rng: np.random.Generator) -> _Cloud:
     return _Cloud(mode, x, log_w)
 
 
-def _row(cloud: _Cloud, n_modes: int, log_group: _Array, log_f: _Array, nis: _Array) -> _Row:
+def _row(cloud: _Cloud, n_modes: int, log_group: _Array, log_f: _Array, nis: _Array, nearest: _Array) -> _Row:
     """Moments over groups by their weights (B, G).
 
     The mean's error is sum_g W_g (x_g - exact): to the error of groups it is that of even weights and means
@@ -257,21 +262,28 @@ def _row(cloud: _Cloud, n_modes: int, log_group: _Array, log_f: _Array, nis: _Ar
     mean, cov = steps.collapse(log_group, group_means, covs.reshape(B, groups, n, n), 1)
     group_means = mean[:, None] + groups * share * (group_means - mean[:, None])
     size = cloud.mode.shape[1]
-    return _Row(
-        (share * probs).sum(1), group_means, mean, cov, log_f, nis, effective_size(w).reshape(B, groups).mean(1) / size
-    )
+    effective = effective_size(w).reshape(B, groups).mean(1) / size
+    return _Row((share * probs).sum(1), group_means, mean, cov, log_f, nis, effective, nearest)
 
 
-def _nis(cloud: _Cloud, n_modes: int, sensor: DiffusionSensor, z: _Array, dt: float) -> _Array:
+def _distances(cloud: _Cloud, n_modes: int, sensor: DiffusionSensor, z: _Array, dt: float) -> tuple[_Array, _Array]:
+    """Squared distances of the measurement from its prediction, and from that of the nearest mode."""
     B, n = len(z), cloud.x.shape[-1]
     x, mode = cloud.x.reshape(B, -1, n), cloud.mode.reshape(B, -1)
     w = np.exp(cloud.log_w).reshape(B, -1)
-    w = w / w.sum(-1, keepdims=True)
-    present = [i for i in range(n_modes) if (mode == i).any()]
-    if (np.isnan(z)).all():
-        return np.zeros(B)
-    nodes = [(x, np.where(mode == i, w, 0.0)) if i in present else (x[:, :1], np.zeros((B, 1))) for i in range(n_modes)]
-    return innovation_nis(sensor, z, dt, nodes)
+    if np.isnan(z).all():
+        return np.zeros(B), np.zeros(B)
+    of_mode = [np.where(mode == i, w, 0.0) for i in range(n_modes)]
+    present = [i for i in range(n_modes) if of_mode[i].any()]
+    away = (x[:, :1], np.zeros((B, 1)))  # of a mode that has no particle, or is not asked for
+
+    def distance(modes: list[int]) -> _Array:
+        total = np.sum([of_mode[i].sum(-1, keepdims=True) for i in modes], axis=0)
+        scale = np.where(total > 0, total, 1.0)
+        d2 = innovation_nis(sensor, z, dt, [(x, of_mode[i] / scale) if i in modes else away for i in range(n_modes)])
+        return np.where(total[:, 0] > 0, d2, np.inf)
+
+    return distance(present), np.min([distance([i]) for i in present], axis=0)
 
 
 def _spread(count: int, rng: np.random.Generator) -> _Array:

@@ -109,7 +109,7 @@ class Estimates:
 def described(found: Estimates, model: HybridModel, times: Float[np.ndarray, " t"]) -> Estimates:
     """Add what the model and the times of the rows say of estimates: names, times, findings."""
     names = tuple(chain.name for chain in model.chains)
-    return replace(found, chains=names, times=times, findings=tuple(per_interval(model, times)))
+    return replace(found, chains=names, times=times, findings=(*found.findings, *per_interval(model, times)))
 
 
 def allocate(

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.errors import DataError, ModelError
+from saltus.filters.refusals import NotPositive
 from saltus.linalg import gaussian_terms
 from saltus.models import DiffusionSensor, HybridModel, SwitchingSDE, as_diffusion
 from saltus.shapes import Bool, Float
@@ -126,29 +127,34 @@ def innovation_nis(
     sensor: DiffusionSensor,
     z: Float[np.ndarray, "b m"],
     dt: float,
-    nodes: Sequence[tuple[Float[np.ndarray, "*lead n"], Float[np.ndarray, "b q"]]],
+    nodes: Sequence[tuple[Float[np.ndarray, "*_lead n"], Float[np.ndarray, "b _q"]]],
 ) -> Float[np.ndarray, " b"]:
     """Nu' S^-1 nu of the predicted measurement, nu and S the moments of z - h(x) over weighted nodes.
+
+    S is summed about nu, never as a difference of squares: it stays positive however far off z is.
 
     Args:
         sensor: what is measured.
         z: one measurement of each run; NaN is missing.
         dt: the interval, for a continuous sensor.
-        nodes: per mode the states (q, n) or (b, q, n) and their probabilities (b, q), which sum to 1 over all modes.
+        nodes: per mode the states (q, n) or (b, q, n) and their probabilities (b, q), which sum to 1 over all modes;
+            0 for a run where all are 0.
+
+    Raises:
+        NumericalError: a measured component has neither noise nor spread.
     """
     seen = ~np.isnan(z)
-    filled = np.where(seen, z, 0.0)[:, None]
-    m = z.shape[-1]
+    filled, m = np.where(seen, z, 0.0)[:, None], z.shape[-1]
     off, weights, S = [], [], np.zeros((len(z), m, m))
-    for mode, (x, weight) in enumerate(nodes):
+    for mode, (x, w) in enumerate(nodes):
         h = sensor.h_at(mode, x)
         off.append(filled - dt * h if sensor.continuous else sensor.residual(filled, h))
-        weights.append(weight[..., None])
+        weights.append(w[..., None])
         noise = sensor.R[mode]
         if callable(noise):
-            S += np.einsum("bq,...qij->bij", weight, sensor.noise_at(mode, x))
+            S += np.einsum("bq,...qij->bij", w, sensor.noise_at(mode, x))
         else:
-            S += weight.sum(-1)[:, None, None] * np.asarray(noise) * (dt if sensor.continuous else 1.0)
+            S += w.sum(-1)[:, None, None] * np.asarray(noise) * (dt if sensor.continuous else 1.0)
     nu = np.asarray(sum((w * e).sum(1) for w, e in zip(weights, off, strict=True)))
     with np.errstate(over="ignore", invalid="ignore"):
         # About the mean: squares of what is left, where raw second moments of an outlier would leave their rounding.
@@ -156,6 +162,10 @@ def innovation_nis(
             left = e - nu[:, None]
             S += np.swapaxes(w * left, -1, -2) @ left
     known = np.asarray(np.isfinite(S).all(axis=(-1, -2)))
-    S = np.where(seen[:, :, None] & seen[:, None, :] & known[:, None, None], S, np.eye(m))
-    d2 = gaussian_terms(np.where(seen & known[:, None], nu, 0.0), S)[0]
+    there = seen & known[:, None] & (np.sum([w.sum((-1, -2)) for w in weights], axis=0) > 0)[:, None]
+    S = np.where(there[:, :, None] & there[:, None, :], S, np.eye(m))
+    try:
+        d2 = gaussian_terms(np.where(there, nu, 0.0), S)[0]
+    except np.linalg.LinAlgError as error:
+        raise NotPositive("the measurement") from error
     return np.where(seen.any(-1), np.where(known, d2, np.inf), 0.0)

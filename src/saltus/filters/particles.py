@@ -16,12 +16,25 @@ import numpy.typing as npt
 from saltus.errors import ModelError
 from saltus.filters import steps
 from saltus.linalg import symmetric
-from saltus.shapes import Float, Int
+from saltus.models import Finding
+from saltus.shapes import Bool, Float, Int
 
-__all__ = ["Merged", "Tables", "effective_size", "expanded", "generator", "group_error", "merged", "systematic"]
+__all__ = [
+    "Merged",
+    "Tables",
+    "effective_size",
+    "expanded",
+    "generator",
+    "group_error",
+    "merged",
+    "systematic",
+    "thinned",
+]
 
 _Array = npt.NDArray[np.float64]
 _Modes = npt.NDArray[np.int64]
+_UNEXPLAINED = 1e-7  # probability of a measurement that far from every mode's prediction
+_FAR = 600.0  # nats from the lightest particle that is sure to stay; beyond, a weight counts as this
 
 
 class Tables(NamedTuple):
@@ -117,6 +130,55 @@ def systematic(weights: Float[np.ndarray, "groups n"], rng: np.random.Generator)
     return np.repeat(np.tile(np.arange(n), groups), times.ravel()).reshape(groups, n)
 
 
+def thinned(
+    log_weights: Float[np.ndarray, "groups k"], n: int, rng: np.random.Generator
+) -> tuple[Int[np.ndarray, "groups n"], Float[np.ndarray, "groups n"]]:
+    """Choose n different particles of k in each group, and weigh them so that expectations stay what they are.
+
+    With c such that sum_i min(w_i / c, 1) = n, particle i is chosen with probability min(w_i / c, 1), by one uniform
+    number per group, and then weighs max(w_i, c): the heavy ones stay as they are, the others are drawn without
+    repetition. Of all unbiased ways to choose n, this changes weights least. However light, a particle is kept while
+    there is room, so that what looked hopeless is still there when later measurements ask for it.
+
+    Args:
+        log_weights: any scale, the same for all of a group; -inf weighs nothing.
+        n: how many to keep.
+        rng: source of randomness.
+
+    Returns:
+        Numbers of those chosen, in order, and their log-weights. Where fewer than n weigh anything, others fill the
+        places, at -inf.
+
+    Source: Fearnhead and Clifford (2003), On-line inference for hidden Markov models via particle filters, JRSS B
+    65(4), section 3.2.
+    """
+    if log_weights.shape[1] < n:
+        rest = np.full((len(log_weights), n - log_weights.shape[1]), -np.inf)
+        chosen, kept = thinned(np.concatenate([log_weights, rest], axis=1), n, rng)
+        return np.where(np.isfinite(kept), chosen, 0), kept
+    k = log_weights.shape[1]
+    ascending = np.sort(log_weights, axis=1)
+    last = ascending[:, k - n, None]  # the nth greatest: none lighter than it is sure
+    scarce = ~np.isfinite(last)  # fewer than n weigh anything: all of them stay
+    scale = np.where(scarce, 0.0, last)
+    w = np.exp(np.clip(ascending - scale, -_FAR, _FAR))
+    below = np.cumsum(w, axis=1)
+    places = np.arange(1, k + 1) + n - k  # for the lightest 1, 2, ... when all the others stay
+    fits = (places > 0) & (w * places <= below * (1 + 1e-12))
+    at = k - 1 - np.argmax(fits[:, ::-1], axis=1)[:, None]
+    log_c = np.where(scarce, -np.inf, np.log(np.take_along_axis(below, at, 1) / places[at]) + scale)
+    with np.errstate(invalid="ignore"):  # -inf less -inf, where all stay
+        sure = np.where(scarce, np.isfinite(log_weights), np.exp(np.minimum(log_weights - log_c, 0.0)))
+    ends = np.ceil(np.cumsum(sure, axis=1) - rng.uniform(size=(len(sure), 1)))
+    taken = np.diff(np.clip(ends, 0, n), axis=1, prepend=0) > 0
+    if taken.sum(axis=1).min() == n:
+        chosen = np.nonzero(taken)[1].reshape(-1, n)
+        return chosen, np.maximum(np.take_along_axis(log_weights, chosen, 1), log_c)
+    chosen = np.argsort(~taken, axis=1, kind="stable")[:, :n]
+    kept = np.maximum(np.take_along_axis(log_weights, chosen, 1), log_c)
+    return chosen, np.where(np.take_along_axis(taken, chosen, 1), kept, -np.inf)
+
+
 def effective_size(weights: Float[np.ndarray, "groups n"]) -> Float[np.ndarray, " groups"]:
     """Return (sum w)^2 / sum w^2: n for equal weights, 1 when one particle has them all."""
     return np.asarray(weights.sum(-1) ** 2 / np.square(weights).sum(-1))
@@ -156,6 +218,44 @@ def group_error(
         ratio = np.divide(squared, unbiased, out=np.ones_like(trace), where=unbiased > 0)
         nu = np.clip(ratio, 1.0, n)
     return np.asarray(np.sqrt(trace / G * fdtri(nu, nu * (G - 1), confidence)))
+
+
+def stated_error(
+    error: Float[np.ndarray, "*rows"],
+    d2: Float[np.ndarray, "*rows"],
+    n_observed: Float[np.ndarray, "*rows"],
+    drawn: Bool[np.ndarray, "*rows"],
+) -> tuple[Float[np.ndarray, "*rows"], tuple[Finding, ...]]:
+    """Take an error for a bound as long as the measurements are such as the model makes.
+
+    Independent groups agree on what none of them has. A measurement that lies far from what every mode expects may
+    rest on states or modes that no particle went through, however alike the groups: from the first such row on, of a
+    probability below 1e-7 under each mode's Gaussian prediction, the error is infinite, that is, nothing is claimed.
+
+    Args:
+        error: of `group_error`, (..., T).
+        d2: squared distance of the measurements from the nearest mode's prediction, (..., T).
+        n_observed: components measured, (..., T).
+        drawn: whether anything was left to chance by then, (..., T): where nothing was, groups are exact.
+
+    Returns:
+        The error, and a finding that names the first row of the first run concerned.
+    """
+    from scipy.special import chdtrc
+
+    far = (n_observed > 0) & (chdtrc(np.maximum(n_observed, 1.0), d2) < _UNEXPLAINED)
+    since = np.logical_or.accumulate(far, axis=-1) & drawn
+    if not since.any():
+        return error, ()
+    *run, row = (int(i) for i in np.argwhere(since)[0])
+    runs = int(since.any(-1).sum())
+    where = f"row {row}" + (f" of run {', '.join(map(str, run))}" if since.ndim > 1 else "")
+    more = f" ({runs} runs have such rows)" if runs > 1 else ""
+    message = (
+        "a measurement until here lies where no mode expects one, and particles may have missed what explains it: from "
+        f"here on nothing is claimed of the error{more}. Give the model a mode that makes such measurements."
+    )
+    return np.where(since, np.inf, error), (Finding("unexplained", where, message),)
 
 
 def generator(rng: np.random.Generator | None) -> np.random.Generator:

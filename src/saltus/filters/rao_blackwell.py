@@ -1,16 +1,17 @@
 """The Rao-Blackwellised particle filter of a jump linear system: particles are histories of modes, a Gaussian each.
 
 Given its modes the system is linear and Gaussian, so a particle carries a Kalman filter and only the modes are drawn.
-A step asks every particle what each next mode would make of the measurement, draws as many (particle, next mode) pairs
-as there are particles from their joint posterior, all by one uniform number, and moves those. The proposal is optimal:
-no weight depends on what was drawn, and no particle goes where the measurement forbids.
+A step asks every particle what each next mode would make of the measurement, and chooses as many of these (particle,
+next mode) pairs as there are particles (`particles.thinned`): the likely ones all, each with its probability, of the
+others some by chance. Particles are therefore different histories, and while there are no more histories than particles
+of a group, the answer is exact.
 
 Particles live in independent groups, each a filter of its own; the answer is their average, and its spread over the
-groups is the filter's own error.
+groups is the filter's own error, as long as some mode explains the measurements (`particles.stated_error`).
 
-Source: Doucet, de Freitas, Murphy and Russell (2000); optimal proposal and resampling before moving: Doucet, Gordon and
-Krishnamurthy (2001), Particle filters for state estimation of jump Markov linear systems, IEEE Trans. SP 49(3); Pitt
-and Shephard (1999) for the fully adapted auxiliary filter.
+Source: Doucet, de Freitas, Murphy and Russell (2000); all next modes before choosing: Doucet, Gordon and Krishnamurthy
+(2001), Particle filters for state estimation of jump Markov linear systems, IEEE Trans. SP 49(3); Fearnhead and
+Clifford (2003), On-line inference for hidden Markov models via particle filters, JRSS B 65(4), for the choice.
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,7 @@ from saltus.filters.backend import Backend
 from saltus.filters.bank import Bank
 from saltus.filters.estimates import Estimates
 from saltus.filters.flat import Flat, flatten
-from saltus.filters.particles import Tables, effective_size, generator, group_error
+from saltus.filters.particles import Tables, effective_size, generator, group_error, stated_error, thinned
 from saltus.filters.refusals import check_evidence
 from saltus.linalg import logsumexp, normalised
 
@@ -79,7 +80,9 @@ def particle_filter(
 
     Returns:
         Estimates; `error` is the distance, in posterior standard deviations, within which the exact mean lies of the
-        one returned, at 95 % confidence (`particles.group_error`), and `effective` the share of particles that count.
+        one returned, at 95 % confidence (`particles.group_error`); 0 as long as there are particles for all histories;
+        infinite, with a finding, from the first measurement on that no mode explains (`particles.stated_error`).
+        `effective` is the share of particles that count.
 
     Raises:
         ModelError: a shape or a law that cannot be, too few particles, or no rng.
@@ -121,6 +124,8 @@ class _Rows(NamedTuple):
     log_likelihood: _Array  # (B, T)
     nis: _Array
     effective: _Array
+    nearest: _Array  # squared distance of the measurement from the nearest mode's prediction
+    drawn: _Array  # 1 once a choice was left to chance, else 0
 
 
 def _divided(flat: Flat, n_particles: int) -> list[Flat]:
@@ -154,29 +159,31 @@ def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backen
     B, M = flat.n_runs, flat.n_modes
     lots = B * groups  # independent filters of `size` particles
     rows = np.arange(lots * size)
-    bank, mode = _start(flat, lots, size, rng, backend)
+    bank, mode, log_w = _start(flat, lots, size, rng, backend)
+    drawn = np.full(B, float(M > size))
     of_lot = np.repeat(np.arange(lots), size)
     z_all = np.where(flat.seen, flat.z, np.nan)
-    weights = np.full(lots * size, 1.0 / size)
-    now = _moments(bank, rows, weights, of_lot * M + mode, (B, groups, M))[0]
+    now = _moments(bank, rows, log_w, of_lot * M + mode, (B, groups, M))[0]
     out = []
     for k in range(flat.n_steps):
         tables, trans = _tables(flat, k), flat.trans(k)[0]
         z = np.repeat(z_all[:, k], groups * size, axis=0)
         law, log_f = bank.expand(rows, mode, trans, z, tables)
         prediction, law_now = _predicted(now, flat, k)
-        first, likelihood = normalised(log_f.reshape(lots, size), (1,))
+        log_w, likelihood = normalised(log_w + log_f.reshape(lots, size), (1,))
         least = likelihood.reshape(B, groups).min(-1)
         check_evidence(least, prediction.y, prediction.Y, flat.z[:, k], flat.seen[:, k], k)
-        share = np.exp(first)
+        share = np.exp(log_w)
         probs = (share[:, None, :] @ law.reshape(lots, size, M))[:, 0]
-        bank, mode = _drawn(bank, share, law, rng)
+        bank, mode, log_w, lost = _branched(bank, log_w, law, rng)
+        drawn = np.maximum(drawn, lost.reshape(B, groups).any(-1))
         F, b, Q, H, d, R = tables
         bank.step(rows, [], F, b, Q, mode=mode)
         bank.update(rows, z, H, d, R, mode=mode)
         nis = steps.mixture_nis(law_now, prediction, flat.z[:, k], flat.seen[:, k], 1)
-        now, group_means, mean, cov = _moments(bank, rows, weights, of_lot * M + mode, (B, groups, M))
-        log_f_runs = logsumexp(likelihood.reshape(B, groups), (1,))[:, 0] - np.log(groups * size)
+        nearest = _nearest(law_now, prediction, flat, k)
+        now, group_means, mean, cov = _moments(bank, rows, log_w, of_lot * M + mode, (B, groups, M))
+        log_f_runs = logsumexp(likelihood.reshape(B, groups), (1,))[:, 0] - np.log(groups)
         out.append(
             _Rows(
                 probs.reshape(B, groups, M).mean(1),
@@ -188,22 +195,24 @@ def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backen
                 np.where(flat.seen[:, k].any(-1), log_f_runs, 0.0),
                 nis,
                 effective_size(share).reshape(B, groups).mean(1) / size,
+                nearest,
+                drawn,
             )
         )
     return _Rows(*(np.stack(arrays, axis=1) for arrays in zip(*out, strict=True)))
 
 
-def _start(flat: Flat, lots: int, size: int, rng: np.random.Generator, backend: Backend | None) -> tuple[Bank, _Modes]:
-    """Draw the prior's modes; each particle then has the prior's Gaussian."""
+def _start(
+    flat: Flat, lots: int, size: int, rng: np.random.Generator, backend: Backend | None
+) -> tuple[Bank, _Modes, _Array]:
+    """One particle per mode of the prior, each with the prior's Gaussian; the other places are empty."""
     M, n = flat.n_modes, flat.mean0.shape[-1]
-    law = np.cumsum(np.exp(flat.log_probs0[0]))
-    points = (rng.uniform(size=(lots, 1)) + np.arange(size)) / size
-    mode = np.searchsorted(law[:-1], points.ravel() * law[-1], side="right").astype(np.int64)
-    mean0 = np.broadcast_to(flat.mean0[0], (M, n))[mode]
-    cov0 = np.broadcast_to(flat.cov0[0], (M, n, n))[mode]
+    mode, log_w = thinned(np.broadcast_to(flat.log_probs0[0], (lots, M)), size, rng)
+    mean0 = np.broadcast_to(flat.mean0[0], (M, n))[mode.ravel()]
+    cov0 = np.broadcast_to(flat.cov0[0], (M, n, n))[mode.ravel()]
     bank = Bank(n, (), capacity=lots * size, backend=backend)
     bank.add(steps.Belief(np.zeros(lots * size), mean0, cov0))
-    return bank, mode
+    return bank, mode.ravel(), log_w - logsumexp(log_w, (1,))
 
 
 def _tables(flat: Flat, k: int) -> Tables:
@@ -215,29 +224,29 @@ def _tables(flat: Flat, k: int) -> Tables:
     return Tables(F, b, Q, H, d, R)
 
 
-def _drawn(bank: Bank, share: _Array, law: _Array, rng: np.random.Generator) -> tuple[Bank, _Modes]:
-    """Draw (particle, next mode) pairs from their joint law by one uniform number per group.
+def _branched(
+    bank: Bank, log_w: _Array, law: _Array, rng: np.random.Generator
+) -> tuple[Bank, _Modes, _Array, npt.NDArray[np.bool_]]:
+    """Choose among all (particle, next mode) pairs of each group; says too for which groups this left some out.
 
-    Pairs of one next mode lie side by side: each mode is drawn in proportion but for less than one particle, and the
-    particles that follow are sorted by mode, as the kernel likes them.
+    Pairs of one next mode lie side by side: the particles that follow are sorted by mode, as the kernel likes them.
     """
-    lots, size = share.shape
-    cells = share[:, None, :] * law.reshape(lots, size, -1).swapaxes(1, 2)
-    bounds = np.cumsum(cells.reshape(lots, -1), axis=1)
-    ends = np.ceil(bounds * (size / bounds[:, -1:]) - rng.uniform(size=(lots, 1))).astype(np.int64)
-    np.clip(ends, 0, size, out=ends)
-    ends[:, -1] = size
-    taken = np.repeat(np.arange(cells.size), np.diff(ends, axis=1, prepend=0).ravel())
-    mode, parents = np.divmod(taken.reshape(lots, size) - cells[0].size * np.arange(lots)[:, None], size)
-    return bank.take((parents + size * np.arange(lots)[:, None]).ravel()), mode.ravel()
+    lots, size = log_w.shape
+    with np.errstate(divide="ignore"):
+        pairs = log_w[:, None, :] + np.log(law).reshape(lots, size, -1).swapaxes(1, 2)
+    pairs = pairs.reshape(lots, -1)
+    chosen, log_w = thinned(pairs, size, rng)
+    mode, parents = np.divmod(chosen, size)
+    bank = bank.take((parents + size * np.arange(lots)[:, None]).ravel())
+    return bank, mode.ravel(), log_w - logsumexp(log_w, (1,)), np.isfinite(pairs).sum(1) > size
 
 
 def _moments(
-    bank: Bank, rows: _Modes, weights: _Array, labels: _Modes, shape: tuple[int, int, int]
+    bank: Bank, rows: _Modes, log_w: _Array, labels: _Modes, shape: tuple[int, int, int]
 ) -> tuple[steps.Belief, _Array, _Array, _Array]:
     """Belief by mode (B, M), means of the groups (B, G, n), mean and covariance (B, n[, n])."""
     B, G, M = shape
-    mass, means, covs = bank.merged(rows, weights, labels, B * G * M)
+    mass, means, covs = bank.merged(rows, np.exp(log_w).ravel(), labels, B * G * M)
     n = means.shape[-1]
     with np.errstate(divide="ignore"):
         log_mass = np.log(mass).reshape(B, G, M)
@@ -258,12 +267,21 @@ def _predicted(now: steps.Belief, flat: Flat, k: int) -> tuple[steps.Joint, _Arr
     return steps.measure(*steps.propagate(means, covs, F, b, Q), H, d, R), log_probs
 
 
+def _nearest(law: _Array, prediction: steps.Joint, flat: Flat, k: int) -> _Array:
+    """Squared distance of the measurement from what the nearest of the possible modes predicts."""
+    of_mode = steps.condition(prediction, flat.z[:, k, None], flat.seen[:, k, None]).d2
+    return np.asarray(np.min(np.where(np.isfinite(law), of_mode, np.inf), axis=-1))
+
+
 def _estimates(rows: _Rows, flat: Flat, batch: tuple[int, ...], per_mode: bool) -> Estimates:
     n = rows.mean.shape[-1]
 
     def shaped(a: _Array, *core: int) -> _Array:
         return np.ascontiguousarray(a).reshape(*batch, flat.n_steps, *core)
 
+    n_observed = shaped(flat.seen.sum(-1).astype(float))
+    spread = group_error(rows.group_means, rows.cov) * rows.drawn  # without chance, groups differ by round-off
+    error, findings = stated_error(shaped(spread), shaped(rows.nearest), n_observed, shaped(rows.drawn) > 0)
     return Estimates(
         probs=shaped(rows.probs, *flat.sizes),
         mean=shaped(rows.mean, n),
@@ -271,9 +289,10 @@ def _estimates(rows: _Rows, flat: Flat, batch: tuple[int, ...], per_mode: bool) 
         log_likelihood=shaped(rows.log_likelihood),
         log_likelihood_start=np.zeros(batch),
         nis=shaped(rows.nis),
-        n_observed=shaped(flat.seen.sum(-1).astype(float)),
+        n_observed=n_observed,
         mode_means=shaped(rows.mode_means, *flat.sizes, n) if per_mode else None,
         mode_covs=shaped(rows.mode_covs, *flat.sizes, n, n) if per_mode else None,
-        error=shaped(group_error(rows.group_means, rows.cov)),
+        error=error,
         effective=shaped(rows.effective),
+        findings=findings,
     )
