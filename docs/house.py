@@ -38,9 +38,10 @@ WORDS = {
     "compiled": "the compiled twins, where built",
     "errors": "ModelError, DataError, NumericalError",
     "shapes": "shapes of arrays in annotations",
+    "streams": "standard streams and signals",
 }
 _COLOURS = (
-    (("errors", "shapes", "geo", "records", "asterix", "framing", "io"), "#eef3ee", "#a9c2aa"),
+    (("errors", "shapes", "streams", "geo", "records", "asterix", "framing", "io"), "#eef3ee", "#a9c2aa"),
     (("models", "simulate", "decisions", "filters", "identify", "tracks"), "#fbeeea", "#dba792"),
     (("evaluate", "montecarlo", "studies"), "#f3eef7", "#bfa9d1"),
     ((), "#e9f0f8", "#9db8d6"),

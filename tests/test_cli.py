@@ -1,6 +1,7 @@
 """The program on the command line: versions, help, and one clear line for what cannot be."""
 
 import os
+import signal
 import subprocess
 import sys
 import tomllib
@@ -136,7 +137,11 @@ def test_a_file_that_is_not_there(tmp_path):
         (FileNotFoundError("a.parquet"), "no such file: a.parquet"),
         (PermissionError("a.parquet"), "permission denied: a.parquet"),
         (OSError("a.parquet"), "reading or writing failed: a.parquet"),
-        (OSError(28, "No space left on device"), "No space left on device"),
+        (OSError(24, "Too many open files", "a"), "Too many open files: a; raise the limit on open files (ulimit -n)"),
+        (
+            ImportError("x.so: cannot open: Too many open files"),
+            "Too many open files; raise the limit on open files (ulimit -n)",
+        ),
         (OSError(28, "No space left on device", "a"), "No space left on device: a"),
     ],
 )
@@ -159,6 +164,65 @@ def test_a_reader_that_has_enough_ends_the_program_quietly(recording, tmp_path):
     os.close(write)
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "out" / "tracks.parquet").exists()
+
+
+@pytest.fixture
+def run(recording, tmp_path):
+    """Run the program in a process of its own with streams of some kind; returns status and standard error."""
+    path, config = recording
+
+    def run(line, **environment):
+        command = f"exec {line.format(saltus=f'{sys.executable} -m saltus', radar=path, config=config)}"
+        done = subprocess.run(
+            ["/bin/bash", "-c", command], cwd=tmp_path, capture_output=True, env={**os.environ, **environment}
+        )
+        return done.returncode, done.stdout, done.stderr.decode()
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("line", "status", "said"),
+    [
+        ("{saltus} info {radar} --date 2025-06-01 >&- 2>&- <&-", 0, ""),
+        ("{saltus} info {radar} --date 2025-06-01 >/dev/full", 2, "saltus: standard output: no space left on device\n"),
+        ("{saltus} info absent.ast 2>/dev/full", 2, ""),
+        ("{saltus} track {radar} -o out --config {config} --no-report >&- 2>/dev/full", 0, ""),
+    ],
+)
+def test_streams_that_are_closed_or_full(run, tmp_path, line, status, said):
+    found, _, err = run(line)
+    assert (found, err) == (status, said)
+    if "track" in line:
+        assert (tmp_path / "out" / "tracks.parquet").read_bytes()[:4] == b"PAR1"
+
+
+def test_letters_that_a_terminal_does_not_know_are_spelt_out(run, tmp_path):
+    """A name that is no UTF-8, and a sensor in Greek on a terminal of Latin letters."""
+    raw = os.fsencode(tmp_path) + b"/r\xff.ast"
+    os.rename(tmp_path / "radar.ast", raw)
+    sensors = tmp_path / "sensors.toml"
+    sensors.write_text(sensors.read_text() + 'name = "σ"\nperiod = 4.0\n', encoding="utf-8")
+    status, out, err = run("{saltus} track $'r\\xff.ast' -o $'o\\xfe' --config {config}", PYTHONIOENCODING="latin-1")
+    assert (status, err) == (0, "")
+    assert rb"noise of \u03c3" in out and rb"written to o\udcfe/" in out
+    assert (Path(os.fsdecode(os.fsencode(tmp_path) + b"/o\xfe")) / "report.html").is_file()
+
+
+@pytest.mark.parametrize(("number", "said"), [(signal.SIGTERM, "ended by SIGTERM"), (signal.SIGINT, "interrupted")])
+def test_a_signal_ends_the_program_and_leaves_nothing(recording, tmp_path, number, said):
+    """It comes while the run waits for a recording that nobody writes."""
+    path, config = recording
+    code = (
+        "import os, signal, saltus.run.command as command\n"
+        f"command.track_plots = lambda *_, **__: os.kill(os.getpid(), {int(number)})\n"
+        "from saltus.cli import main; main()"
+    )
+    arguments = ["track", path, "-o", tmp_path / "out", "--config", config]
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+    assert done.returncode == 128 + number
+    assert done.stderr == f"saltus: {said}; nothing half-written was left\n"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["radar.ast", "sensors.toml"]
 
 
 def test_an_empty_file(tmp_path):

@@ -1,13 +1,15 @@
 """The program `saltus`: each command is one function elsewhere, imported when it runs."""
 
+import errno
 import os
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NoReturn
 
 import click
 
 from saltus.errors import SaltusError
+from saltus.streams import Stopped, silence, stoppable, usable_streams, what_failed
 from saltus.text import say
 
 __all__ = ["main"]
@@ -27,30 +29,36 @@ _FILE = _Path()
 class _Group(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         """Turn every expected failure into one clear line and a non-zero exit status."""
+        usable_streams()
         try:
-            return super().invoke(ctx)
+            with stoppable():
+                outcome = super().invoke(ctx)
+                sys.stdout.flush()
+                return outcome
         except SaltusError as error:
-            say(f"saltus: {error}", err=True)
-            sys.exit(2)
+            _end(str(error), 2)
         except BrokenPipeError:
             # Whoever read the output has closed it, as head does. Commands write their files before they say so.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            silence(sys.stdout)
             sys.exit(0)
         except OSError as error:
-            say(f"saltus: {_said(error)}", err=True)
-            sys.exit(2)
+            if error.filename is None and error.errno == errno.ENOSPC:
+                silence(sys.stdout)
+                _end("standard output: no space left on device", 2)
+            _end(what_failed(error), 2)
+        except ImportError as error:
+            if os.strerror(errno.EMFILE) not in str(error):
+                raise
+            _end(what_failed(OSError(errno.EMFILE, os.strerror(errno.EMFILE))), 2)
+        except Stopped as signal:
+            _end(f"ended by {signal}; nothing half-written was left", 128 + signal.number)
         except KeyboardInterrupt:
-            click.echo("saltus: interrupted; nothing half-written was left", err=True)
-            sys.exit(130)
+            _end("interrupted; nothing half-written was left", 130)
 
 
-def _said(error: OSError) -> str:
-    """What happened, and to which file; libraries raise some with nothing but a path."""
-    if error.strerror is None:
-        kinds = {FileNotFoundError: "no such file", PermissionError: "permission denied"}
-        what = next((text for kind, text in kinds.items() if isinstance(error, kind)), "reading or writing failed")
-        return f"{what}: {error}"
-    return error.strerror if error.filename is None else f"{error.strerror}: {error.filename}"
+def _end(line: str, status: int) -> NoReturn:
+    say(f"saltus: {line}", err=True)
+    sys.exit(status)
 
 
 _FRAMING = click.option(

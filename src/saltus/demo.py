@@ -75,14 +75,19 @@ def run_demo(output: Path, seed: int) -> None:
         simulated = _write_scene(folder, seed)
         summary, lines = write_tracks(simulated.files, folder, bar, simulated.config)
     show_summary(summary, output, True, lines)
-    tracks = pq.read_table(output / "tracks.parquet")
+    tracks, assignments = (_table_of(output / f"{name}.parquet") for name in ("tracks", "assignments"))
     truth = read_reference(output / "truth.parquet")
-    score = score_demo(tracks, pq.read_table(output / "assignments.parquet"), simulated.labels, truth)
+    score = score_demo(tracks, assignments, simulated.labels, truth)
     console.print(_table(score))
     for line in _summary(score):
         console.print(line, soft_wrap=True)
     files = ", ".join(sorted(p.name for p in output.iterdir() if p.is_file() and not p.name.startswith(".")))
     console.print(f"Written to {output}: {files}", soft_wrap=True)
+
+
+def _table_of(path: Path) -> pa.Table:
+    with path.open("rb") as file:
+        return pq.read_table(file)
 
 
 def write_demo(output: Path, seed: int) -> Simulated:

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots
-from saltus.text import say
+from saltus.text import say, shown
 from saltus.tracks.health import Health, sensor_health
 from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
@@ -100,7 +100,7 @@ def summarise(
     hours = float(np.ptp(tracked.measurements.time)) / 3600.0
     return {
         "version": version("saltus"),
-        "inputs": [Path(p).name for p in inputs],
+        "inputs": [shown(Path(p).name) for p in inputs],
         "time_from": float(tracked.measurements.time[0]),
         "time_to": float(tracked.measurements.time[-1]),
         "reports": {"read": len(plots), "used": used, "unused": len(plots) - used},

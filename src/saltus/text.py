@@ -1,5 +1,9 @@
 """Text from outside, made fit to be read: what would steer a terminal is spelt out, what is endless is cut."""
 
+import sys
+
+from saltus.streams import silence
+
 __all__ = ["brief", "cut", "say", "shown"]
 
 
@@ -33,8 +37,14 @@ def say(text: str, *, err: bool = False) -> None:
 
     Args:
         text: lines; what is unprintable in them is spelt out.
-        err: to standard error.
+        err: to standard error; what nobody reads there, or cannot be written, is lost and nothing else.
     """
     import click
 
-    click.echo("\n".join(shown(line) for line in text.split("\n")), err=err)
+    lines = "\n".join(shown(line) for line in text.split("\n"))
+    try:
+        click.echo(lines, err=err)
+    except OSError:
+        if not err:
+            raise
+        silence(sys.stderr)

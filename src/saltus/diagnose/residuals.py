@@ -48,7 +48,8 @@ def from_table(path: Path, columns: Sequence[str], series: str | None) -> Residu
     import pyarrow.parquet as pq
 
     try:
-        table = pq.read_table(path) if path.suffix.lower() in (".parquet", ".pq") else csv.read_csv(path)
+        with path.open("rb") as file:
+            table = pq.read_table(file) if path.suffix.lower() in (".parquet", ".pq") else csv.read_csv(file)
     except pa.ArrowInvalid as error:
         raise DataError(f"{path}: is no table: {error}") from None
     wanted = ["time", *columns] + ([series] if series is not None else [])

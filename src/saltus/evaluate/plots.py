@@ -79,7 +79,8 @@ def downlinked(plots: Plots, path: Path) -> Motion:
     if not path.is_file():
         raise DataError(f"{path}: no such file.")
     try:
-        table = pq.read_table(path)
+        with path.open("rb") as file:
+            table = pq.read_table(file)
     except (pa.ArrowException, OSError) as error:
         raise DataError(
             f"{path}: no Parquet table. A reference is one of the same plots with what aircraft downlinked (BDS 5,0), "

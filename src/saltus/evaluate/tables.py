@@ -107,7 +107,8 @@ def _table(path: Path, needed: Sequence[str]) -> pa.Table:
     if not path.is_file():
         raise DataError(f"{path}: {'is a folder; name a table' if path.is_dir() else 'no such file'}.")
     try:
-        table = csv_as_text(path) if path.suffix.lower() == ".csv" else pq.read_table(path)
+        with path.open("rb") as file:
+            table = csv_as_text(path) if path.suffix.lower() == ".csv" else pq.read_table(file)
     except pa.ArrowException as error:
         said = _ragged(path) if path.suffix.lower() == ".csv" else str(error).splitlines()[0]
         raise DataError(f"{path}: no readable table: {said}") from error

@@ -78,7 +78,8 @@ def _columns(path: Path, form: str) -> list[str]:
     from pyarrow import parquet
 
     try:
-        names: list[str] = parquet.read_schema(path).names
+        with path.open("rb") as file:
+            names: list[str] = parquet.read_schema(file).names
     except (pyarrow.ArrowException, OSError):
         return []
     return names

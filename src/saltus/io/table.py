@@ -166,7 +166,8 @@ def read_parquet(path: Path) -> Part:
     from pyarrow import parquet
 
     try:
-        table = parquet.read_table(path)
+        with path.open("rb") as file:  # a name may be no UTF-8, which Arrow asks for
+            table = parquet.read_table(file)
     except (pa.ArrowException, OSError) as error:
         raise DataError(f"{path}: no readable Parquet table: {str(error).splitlines()[0]}") from error
     return _read(path, table, np.zeros(table.num_rows, np.bool_), [])

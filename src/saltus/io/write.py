@@ -122,8 +122,8 @@ def write_table(path: Path, table: "pa.Table") -> None:
     """Write a table as Parquet; a failure names the file."""
     import pyarrow.parquet as pq
 
-    with blamed(path):
-        pq.write_table(table, path)
+    with blamed(path), path.open("wb") as file:
+        pq.write_table(table, file)
 
 
 @contextmanager
