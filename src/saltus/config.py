@@ -13,6 +13,7 @@ category = 48                     # optional: sources of this category only
 name = "BCN"                      # optional, each its own; alone, without sac and sic, it names the source of a table
 sigma_range = 30.0                # optional noise: m,
 sigma_azimuth = 0.08              # degrees,
+sigma_elevation = 0.3             # degrees,
 sigma_xy = 10.0                   # m (plane and geodetic positions),
 sigma_altitude = 8.0              # m
 sigma_time = 0.06                 # s (time stamps of positions)
@@ -58,6 +59,7 @@ _HINTS = {
     "height": "m above mean sea level, -450 to 9000 (1 ft = 0.3048 m); leave it out when unknown",
     "sigma_range": "one standard deviation in m, above 0 and up to 10000",
     "sigma_azimuth": "one standard deviation in degrees, above 0 and up to 10",
+    "sigma_elevation": "one standard deviation in degrees, above 0 and up to 10",
     "sigma_xy": "one standard deviation in m, above 0 and up to 10000",
     "sigma_altitude": "one standard deviation in m, above 0 and up to 10000",
     "sigma_time": "one standard deviation in s, 0 to 10",
@@ -92,6 +94,7 @@ class SensorConfig(BaseModel):
     name: _Name = ""
     sigma_range: _Sigma | None = None
     sigma_azimuth: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
+    sigma_elevation: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     sigma_xy: _Sigma | None = None
     sigma_altitude: _Sigma | None = None
     sigma_time: Annotated[float, Field(ge=0.0, le=10.0)] | None = None

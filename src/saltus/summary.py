@@ -18,7 +18,17 @@ from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
 from saltus.tracks.rows import Assignments, Rows, join_rows
 
-__all__ = ["SIGMAS", "Sensors", "Tracked", "health_of", "noise_rows", "reported_kind", "show_summary", "summarise"]
+__all__ = [
+    "SIGMAS",
+    "Sensors",
+    "Tracked",
+    "health_of",
+    "noise_rows",
+    "reported_kind",
+    "show_summary",
+    "sigmas",
+    "summarise",
+]
 
 _DOUBTFUL_NIS = 3.0  # of two degrees of freedom
 _TOO_SMALL_NIS = 0.3
@@ -26,6 +36,7 @@ _FAR_OFF = 30.0  # factor between a configured standard deviation and the estima
 _UNITS = {
     "sigma_range_m": "σ of range, m",
     "sigma_azimuth_deg": "σ of azimuth, °",
+    "sigma_elevation_deg": "σ of elevation, °",
     "sigma_xy_m": "σ of position, m",
     "sigma_time_s": "σ of time stamps, s",
 }
@@ -59,6 +70,13 @@ class Tracked:
     plane: Plane
     noise: dict[int, Noise]
     estimates: dict[int, NoiseEstimate]
+
+
+def sigmas(plots: Plots, s: int) -> tuple[tuple[str, str, float], ...]:
+    """Return the standard deviations that say how good the reports of a source are: label, field of Noise, unit."""
+    kind, own = reported_kind(plots, s), plots.source == s
+    measured = kind == Kind.POLAR and np.isfinite(plots.elevation[own & (plots.kind == Kind.POLAR)]).any()
+    return SIGMAS[kind] + ((("sigma_elevation_deg", "elevation", 180.0 / np.pi),) if measured else ())
 
 
 def reported_kind(plots: Plots, s: int) -> int:
@@ -129,7 +147,7 @@ def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, 
         at = (measurement >= 0) & (m.source[measurement] == s) & np.isfinite(d2)
         given, found, used = sensors.configured[s], tracked.estimates[s], tracked.noise[s]
         row: dict[str, object] = {"system": str(plots.sources[s].system)}
-        for label, field, scale in SIGMAS[reported_kind(plots, s)]:
+        for label, field, scale in sigmas(plots, s):
             row[label] = {
                 "configured": _rounded(given.get(field, np.nan) * scale),
                 "estimated": _rounded(getattr(found, field) * scale),

@@ -147,3 +147,15 @@ def test_a_single_plot_is_no_track(rng):
     assert (found.track_id == 0).all()
     assert len(found.raw.confirmed) == 0
     assert len(np.unique(found.raw.track_id)) == 3
+
+
+def test_an_altitude_is_told_until_it_is_vague_for_what_told_it():
+    life = Lifecycle(TrackerSettings())
+    rows, cov = np.arange(3), np.zeros((3, 6, 6))
+    life.begin(rows, Birth(np.zeros(3), np.ones(3), np.zeros(3, int), np.zeros((3, 6)), cov))
+    assert not life.knows_altitude(rows, cov).any()
+    # Mode C of 10 m, an elevation that makes 1500 m at that range, and nothing.
+    life.heard_altitude(rows, np.array([True, True, False]), np.array([10.0, 1500.0, 1.0]) ** 2)
+    for sigma, told in ((400.0, [True, True, False]), (600.0, [False, True, False]), (5000.0, [False] * 3)):
+        cov[:, 4, 4] = sigma**2
+        assert life.knows_altitude(rows, cov).tolist() == told

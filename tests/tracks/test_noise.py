@@ -1,5 +1,7 @@
 """The noise found from tracks is the noise that was simulated."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tracking_scenes import SITE, measured, observed
@@ -175,3 +177,17 @@ def test_estimate_of_quantised_plots_stays_above_the_step(rng):
     source = Source(System(None, None, None, "grid"), xy_lsb=step)
     assert apply_estimate(Noise(), found, source).xy >= step / np.sqrt(12.0) * (1 - 1e-12)
     assert apply_estimate(Noise(), found, source).xy == pytest.approx(step / np.sqrt(12.0), rel=0.2)
+
+
+@pytest.mark.parametrize("sigma_deg", [0.05, 1.0])
+def test_the_noise_of_elevations_is_recovered_and_never_below_their_step(rng, sigma_deg):
+    sigma = float(np.radians(sigma_deg))
+    m, label = seen_by(rng, 30.0, np.radians(0.03))
+    assert np.isnan(estimate_noise(m, label, 0).elevation)  # heights were told, not measured
+    exact = np.arctan2(m.position[:, 2] - SITE.height, np.hypot(*m.ray.T))
+    m = replace(m, elevation=exact + sigma * rng.standard_normal(len(m)))
+    found = estimate_noise(m, label, 0)
+    # The median deviation of n has the relative standard error 1.17 / sqrt(n): five of these, windows correlated.
+    assert found.elevation == pytest.approx(sigma, rel=5.0 * 1.2 * 1.17 / np.sqrt(found.n_windows))
+    coarse = Source(System(None, None, None, "grid"), elevation_lsb=float(np.radians(6.0)))
+    assert apply_estimate(Noise(), found, coarse).elevation == pytest.approx(np.radians(6.0) / np.sqrt(12.0))

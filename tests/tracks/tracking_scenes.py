@@ -48,6 +48,7 @@ def measured(time, xy, sigma, *, altitude=None, sigma_altitude=10.0, source=0, i
         mode3a=column(mode3a, np.int16),
         callsign=np.full(n, "", "U8"),
         polar=np.full((n, 2), np.nan),
+        elevation=np.full(n, np.nan),
         ray=np.full((n, 2), np.nan),
         lever=np.zeros((n, 2)),
         origin=np.full((n, 2), np.nan),

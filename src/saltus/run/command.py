@@ -305,10 +305,13 @@ def _noise(sensor: SensorConfig, period: float) -> dict[str, float]:
     Of errors with the correlation a^|k| between reports k periods apart, a = exp(-period / correlation_time), the mean
     of many has (1 + a)/(1 - a) times the variance of as many independent ones: their inflation.
     """
-    azimuth = None if sensor.sigma_azimuth is None else float(np.radians(sensor.sigma_azimuth))
+    azimuth, elevation = (
+        None if sigma is None else float(np.radians(sigma)) for sigma in (sensor.sigma_azimuth, sensor.sigma_elevation)
+    )
     given = {
         "range": sensor.sigma_range,
         "azimuth": azimuth,
+        "elevation": elevation,
         "xy": sensor.sigma_xy,
         "altitude": sensor.sigma_altitude,
         "time": 0.0 if sensor.sigma_time is None and sensor.sigma_xy is not None else sensor.sigma_time,

@@ -10,7 +10,7 @@ from saltus.config import Config
 from saltus.geo import Plane
 from saltus.progress import Progress
 from saltus.records import Plots
-from saltus.summary import SIGMAS, Sensors, Tracked, reported_kind
+from saltus.summary import Sensors, Tracked, sigmas
 from saltus.tracks.measurements import Measurements, default_noise, place_plots
 from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
 from saltus.tracks.rows import Assignments, Rows, assignments, join_fates, join_rows
@@ -89,7 +89,7 @@ def _steady_d2(rows: Sequence[Rows], m: Measurements, s: int) -> _Array:
 
 def _configured(plots: Plots, s: int, given: dict[str, float]) -> bool:
     """Say whether the configuration gives every standard deviation that the source's reports need."""
-    return {field for _, field, _ in SIGMAS[reported_kind(plots, s)]} <= set(given)
+    return {field for _, field, _ in sigmas(plots, s)} <= set(given)
 
 
 def _first_stretch(plots: Plots) -> Plots:

@@ -125,7 +125,7 @@ class Fusion:
         periods = self._periods[m.source[new.number]]
         life.begin(rows, Birth(m.time[new.number], periods, new.number, new.mean, new.cov))
         life.id[rows] = new.track
-        life.has_altitude[rows] = np.isfinite(m.position[new.number, 2])
+        life.heard_altitude(rows, np.isfinite(m.position[new.number, 2]), m.cov[new.number, 2, 2])
         self._note(m, rows, new)
         cov = m.cov[new.number, :2, :2] + new.extra
         nothing, none = np.full(n, np.nan), np.zeros(n, np.int8)
@@ -151,7 +151,7 @@ class Fusion:
             life.sighted(rows, m.time[plots])
         else:
             life.hit(rows, m.time[plots], self._periods[m.source[plots]], plots)
-            life.has_altitude[rows] |= gated.height_used
+            life.heard_altitude(rows, gated.height_used, m.cov[plots, 2, 2])
             life.p_fault[rows] = judged.wrong
         self._note(m, rows, given)
         d2 = np.where((judged.wrong > 0.5) | source.degraded | sights, np.nan, gated.d2)

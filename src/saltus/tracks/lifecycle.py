@@ -16,6 +16,7 @@ _Rows = npt.NDArray[np.intp]
 SEED, TENTATIVE, CONFIRMED, COASTED = 0, 1, 2, 3
 STATUS = ("tentative", "tentative", "confirmed", "coasted")
 NO_CODE = -1
+_VAGUE, _VAGUER = 500.0, 3.0  # m, and of a sensor's own: what says nothing any more
 _SLACK = 0.6  # of a period: how late a plot may come before it counts as missed
 
 
@@ -48,6 +49,7 @@ class Lifecycle:
         self.coasted = np.zeros(0, np.int64)  # coasted rows published since the last update
         self.p_fault = np.zeros(0)  # probability that the last plot was faulty, NaN where nothing told
         self.has_altitude = np.zeros(0, bool)
+        self.sigma_altitude = np.zeros(0)  # standard deviation of the last altitude used, m
         self.icao24 = np.zeros(0, np.int32)
         self.mode3a = np.zeros(0, np.int16)
         self.plot = np.zeros(0, np.int64)  # number of the last plot
@@ -84,6 +86,7 @@ class Lifecycle:
         self.coasted[rows] = 0
         self.p_fault[rows] = np.nan
         self.has_altitude[rows] = False
+        self.sigma_altitude[rows] = 0.0
         self.icao24[rows] = self.mode3a[rows] = NO_CODE
         self.callsign[rows] = ""
 
@@ -116,6 +119,19 @@ class Lifecycle:
         self.located[rows] = np.maximum(self.located[rows], time)
         self.coasted[rows] = 0
         self.plot[rows] = plot
+
+    def heard_altitude(self, rows: _Rows, used: npt.NDArray[np.bool_], variance: _Array) -> None:
+        """Note for each row whether its plot's altitude was used, and how good it was, m^2."""
+        self.has_altitude[rows] |= used
+        self.sigma_altitude[rows[used]] = np.sqrt(variance[used])
+
+    def knows_altitude(self, rows: _Rows, cov: _Array) -> npt.NDArray[np.bool_]:
+        """Say which altitudes are worth telling, of states with covariances (k, 6, 6).
+
+        Those told once, until their standard deviation exceeds 500 m, or three times that of what tells them.
+        """
+        limit = np.maximum(_VAGUE, _VAGUER * self.sigma_altitude[rows])
+        return np.asarray(self.has_altitude[rows] & (cov[:, 4, 4] <= limit**2))
 
     def sighted(self, rows: _Rows, time: _Array) -> None:
         """Enter a bearing for each row: it moves the state, and neither confirms the track nor keeps it alive."""

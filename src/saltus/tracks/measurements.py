@@ -63,6 +63,7 @@ def default_noise(source: Source) -> Noise:
         Noise(),
         range=max(_RANGE, source.range_lsb / step),
         azimuth=float(max(_AZIMUTH, source.azimuth_lsb / step)),
+        elevation=float(max(_ELEVATION, source.elevation_lsb / step)),
         xy=max(_XY, source.xy_lsb / step),
         altitude=max(_ALTITUDE, source.altitude_lsb / step),
         time=max(source.traits.sigma_time, source.time_lsb / step),
@@ -82,6 +83,7 @@ class Measurements:
     mode3a: npt.NDArray[np.int16]
     callsign: npt.NDArray[Any]  # "" none
     polar: _Array  # (N, 2): slant range (m) and azimuth (rad) where the source measures them, else NaN
+    elevation: _Array  # (N,): rad where the height comes from one, else NaN
     ray: _Array  # (N, 2): from the site to the position in the plane, m; NaN where the source is not polar
     lever: _Array  # (N, 2): change of plane position per metre of height error, 0 where none
     origin: _Array  # (N, 2): plane x, y of the observer of a bearing, m; NaN where there is a position instead
@@ -244,6 +246,7 @@ def place_plots(
         mode3a=plots.mode3a[usable],
         callsign=plots.callsign[usable].astype("U8"),
         polar=np.stack([plots.range[usable], plots.azimuth[usable]], axis=-1),
+        elevation=np.where(plots.kind[usable] == Kind.POLAR, plots.elevation[usable], np.nan),
         ray=ray,
         lever=lever,
         origin=sights[:, :2],

@@ -34,6 +34,7 @@ class NoiseEstimate(NamedTuple):
     xy: float  # m, each axis, for sources that give plane or geodetic positions
     time: float  # s, of the time stamps of such sources
     n_windows: int
+    elevation: float = float("nan")  # rad
 
 
 def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int) -> NoiseEstimate:
@@ -44,7 +45,7 @@ def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int
     acceleration the target has. Along and across the ray from the radar, sigma is the root mean square of
     e / sqrt(1 - h) over all straight windows, those beyond four median deviations (outliers, turns) left out. Of
     positions, sigma is found across the course, and from what is more along it the deviation of time stamps tau:
-    mean e^2 = sigma^2 + tau^2 v^2.
+    mean e^2 = sigma^2 + tau^2 v^2. Elevations are taken as they are, without the range errors in their heights.
 
     Args:
         m: measurements in time order.
@@ -82,7 +83,17 @@ def _estimated(
     if moving.sum() >= _MIN_WINDOWS:  # what stands still repeats one rounded position and shows no noise
         straight = moving
     middle = window[whole, _WINDOW // 2][straight]
-    return _scatter(residual[straight], velocity[straight], m.ray[middle])
+    found = _scatter(residual[straight], velocity[straight], m.ray[middle])
+    return found._replace(elevation=_of_elevations(m, window[whole][straight], time[whole][straight]))
+
+
+def _of_elevations(m: Measurements, window: npt.NDArray[np.intp], time: _Array) -> float:
+    """Return the standard deviation of elevations, rad; NaN where too few are measured."""
+    measured = np.isfinite(m.elevation[window]).all(axis=1)
+    if measured.sum() < _MIN_WINDOWS:
+        return np.nan
+    residual, *_ = _middle_residuals(time[measured], m.elevation[window[measured]][..., None])
+    return float(_MAD * np.median(np.abs(residual)))  # climbs begin and end within the windows of some tracks
 
 
 def _middle_residuals(time: _Array, xy: _Array) -> tuple[_Array, _Array, _Array]:
@@ -146,6 +157,7 @@ def apply_estimate(noise: Noise, estimate: NoiseEstimate, source: Source) -> Noi
         noise,
         range=at_least(estimate.range, source.range_lsb, noise.range),
         azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth),
+        elevation=at_least(estimate.elevation, source.elevation_lsb, noise.elevation),
         xy=at_least(estimate.xy, source.xy_lsb, noise.xy),
         time=estimate.time if np.isfinite(estimate.time) else noise.time,
     )

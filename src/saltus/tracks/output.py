@@ -25,8 +25,6 @@ __all__ = [
 
 _Array = npt.NDArray[np.float64]
 
-_VAGUE = 500.0  # m: standard deviation of an altitude that says nothing any more
-
 SPLIT = "split plot"
 ELSEWHERE = "address elsewhere"  # far from the track that has its address
 BEARING = "bearing alone"  # in no confirmed track's direction: it starts none
@@ -43,7 +41,7 @@ def track_table(rows: Rows, plane: Plane, sigma_pressure: float) -> pa.Table:
     mean, cov = rows.moments.mean, rows.moments.cov.copy()
     push = rows.lever * sigma_pressure
     cov[:, 0:3:2, 0:3:2] += push[:, :, None] * push[:, None, :]
-    told = rows.has_altitude & (cov[:, 4, 4] <= _VAGUE**2)
+    told = rows.has_altitude
     altitude = np.where(told, mean[:, 4], np.nan)
     true = plane.to_true(mean[:, :4], cov[:, :4, :4], altitude)
     ve, vn = true.velocity.T

@@ -47,7 +47,7 @@ def updated_rows(
         time=life.time[rows],  # of the state: a late plot is older
         moments=moments,
         status=life.status[rows],
-        has_altitude=life.has_altitude[rows],
+        has_altitude=life.knows_altitude(rows, moments.cov),
         icao24=life.icao24[rows],
         mode3a=life.mode3a[rows],
         callsign=life.callsign[rows],
@@ -83,7 +83,7 @@ def _coasted(life: Lifecycle, rows: _Index, moments: Moments, time: _Array, know
         time=time,
         moments=moments,
         status=np.full(n, COASTED, np.int8),
-        has_altitude=life.has_altitude[rows],
+        has_altitude=life.knows_altitude(rows, moments.cov),
         icao24=life.icao24[rows],
         mode3a=life.mode3a[rows],
         callsign=life.callsign[rows],

@@ -286,7 +286,7 @@ class Tracker:
         life = self._life
         fresh = life.status[rows] != CONFIRMED
         life.hit(rows, self._m.time[plots], np.full(len(rows), wait), self._m.plot[plots], sound)
-        life.has_altitude[rows] |= height_used
+        life.heard_altitude(rows, height_used, self._m.cov[plots, 2, 2])
         self._note(rows, self._m, plots)
         life.sound_time[rows[sound]] = self._m.time[plots[sound]]
         life.sound_source[rows[sound]] = self._m.source[plots[sound]]
@@ -329,7 +329,7 @@ class Tracker:
         life, start = self._life, self._starts.of_one(m, plots)
         rows = self._kinematics.add(start)
         life.begin(rows, Birth(m.time[plots], np.full(len(plots), wait), m.plot[plots], *start))
-        life.has_altitude[rows] = np.isfinite(m.position[plots, 2])
+        life.heard_altitude(rows, np.isfinite(m.position[plots, 2]), m.cov[plots, 2, 2])
         self._note(rows, m, plots)
         life.sound_time[rows], life.sound_source[rows] = m.time[plots], m.source[plots]
         return rows
