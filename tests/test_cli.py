@@ -1,5 +1,6 @@
 """The program on the command line: versions, help, and one clear line for what cannot be."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
 
@@ -323,6 +325,33 @@ def test_configurations_that_cannot_be(recording, tmp_path, content, words):
     for word in ("wrong.toml", *words):
         assert word in line
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("rows", "why"),
+    [
+        (["0,48.0,11.0", "4,48.0,11.01"], "2 reports with a position can be tracked."),
+        (["0,48.0,11.0", "1,48.0,11.001", "2,48.0,11.002"], "the reports last 2 s. Track a longer time"),
+        ([f"{4 * k},{48.0 + k % 3},{11.0 + k % 2}" for k in range(9)], "no report has another near it"),
+        (
+            [f"{40 * (k // 2) + 4 * (k % 2)},48.{k // 2},11.0" for k in range(12)],
+            "the longest of 6 begun got 2: is the update period another",
+        ),
+    ],
+)
+def test_a_run_without_a_track_says_why_and_writes_its_tables(tmp_path, rows, why):
+    (tmp_path / "a.csv").write_text("source,time,latitude,longitude\n" + "".join(f"r,{row}\n" for row in rows))
+    (tmp_path / "a.toml").write_text('[[sensor]]\nname = "r"\nperiod = 4.0\nsigma_xy = 30.0\n')
+    arguments = ["track", tmp_path / "a.csv", "-o", tmp_path / "out", "--config", tmp_path / "a.toml"]
+    result = saltus(*arguments)
+    assert result.exit_code == 2, result.output
+    (line,) = (line for line in result.stderr.splitlines() if line.startswith("note: no track: "))
+    assert "none got 3 reports in 5 update periods" in line and why in line
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["problems"][-1] == line.removeprefix("note: ")
+    assert pq.read_table(tmp_path / "out" / "tracks.parquet").num_rows == 0
+    assert pq.read_table(tmp_path / "out" / "assignments.parquet").num_rows == len(rows)
+    assert (tmp_path / "out" / "report.html").exists()
+    assert saltus(*arguments, "--allow-empty").exit_code == 0
 
 
 def test_track_says_what_it_did(recording, tmp_path):

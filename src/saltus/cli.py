@@ -4,7 +4,7 @@ import errno
 import os
 import sys
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Any, Literal, NoReturn
 
 import click
 
@@ -107,6 +107,7 @@ def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, framin
 @click.option("--from", "time_from", metavar="TIME", help="First time, HH:MM[:SS] or ISO 8601, UTC.")
 @click.option("--to", "time_to", metavar="TIME", help="Last time, HH:MM[:SS] or ISO 8601, UTC.")
 @click.option("--no-report", is_flag=True, help="Do not write report.html.")
+@click.option("--allow-empty", is_flag=True, help="Exit with 0 also when no track was found.")
 def track(
     inputs: tuple[Path, ...],
     output: Path,
@@ -117,11 +118,19 @@ def track(
     time_from: str | None,
     time_to: str | None,
     no_report: bool,
+    allow_empty: bool,
 ) -> None:
-    """Track recordings: tracks.parquet, assignments.parquet, summary.json, report.html in OUTPUT."""
+    """Track recordings: tracks.parquet, assignments.parquet, summary.json, report.html in OUTPUT.
+
+    Without any track these are written all the same, a note says why there is none, and the exit status is 2.
+    """
     from saltus.run import track_files
 
-    track_files(inputs, output, config, date, identity, time_from, time_to, report=not no_report, framing=framing)
+    summary: dict[str, Any] = track_files(
+        inputs, output, config, date, identity, time_from, time_to, report=not no_report, framing=framing
+    )
+    if not summary["tracks"]["confirmed"] and not allow_empty:
+        sys.exit(2)
 
 
 @main.command()

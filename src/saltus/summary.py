@@ -17,6 +17,7 @@ from saltus.tracks.health import Health, sensor_health
 from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
 from saltus.tracks.rows import Assignments, Rows, join_rows
+from saltus.tracks.settings import TrackerSettings
 
 __all__ = [
     "SIGMAS",
@@ -28,6 +29,7 @@ __all__ = [
     "show_summary",
     "sigmas",
     "summarise",
+    "why_no_track",
 ]
 
 _DOUBTFUL_NIS = 3.0  # of two degrees of freedom
@@ -134,6 +136,27 @@ def summarise(
         "faults": _fault_table(health_of(sensors, tracked)),
         "problems": [*problems, *_doubts(noise, several=several)],
     }
+
+
+def why_no_track(sensors: Sensors, tracked: Tracked, settings: TrackerSettings) -> str:
+    """Say in one line why no track was confirmed: few reports, a short time, none near, or too few in a row."""
+    m, hits, scans = tracked.measurements, settings.confirm_hits, settings.confirm_scans
+    placed = np.isfinite(m.position[:, 0]) & np.isnan(m.bearing)
+    reports = tracked.assignments.track_id[placed]
+    reports = np.bincount(reports[reports > 0], minlength=1)
+    period = min(sensors.periods[s] for s in np.unique(m.source[placed])) if placed.any() else np.inf
+    said, span = f"no track: none got {hits} reports in {scans} update periods", float(np.ptp(m.time))
+    ask = "is the update period another (period in its [[sensor]] table), or a unit wrong (NM for m, feet for m)?"
+    if placed.sum() < hits:
+        return f"{said}; {placed.sum()} reports with a position can be tracked."
+    if span < (hits - 1) * period:
+        return f"{said} of {period:.3g} s; the reports last {span:.3g} s. Track a longer time; {ask}"
+    if reports.max() < 2:
+        return (
+            f"{said} of {period:.3g} s; no report has another near it within that time, at up to "
+            f"{settings.max_speed:g} m/s (max_speed): {ask}"
+        )
+    return f"{said} of {period:.3g} s; the longest of {np.sum(reports > 1)} begun got {reports.max()}: {ask}"
 
 
 def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, object]:

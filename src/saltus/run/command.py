@@ -28,7 +28,7 @@ from saltus.run.identified import (
     systems_found,
 )
 from saltus.run.pipeline import Identified, track_plots
-from saltus.summary import Sensors, Tracked, health_of, noise_rows, show_summary, summarise
+from saltus.summary import Sensors, Tracked, health_of, noise_rows, show_summary, summarise, why_no_track
 from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.rows import Rows, join_rows
 
@@ -110,8 +110,9 @@ def write_tracks(
     assigned = assignment_table(plots, tracked.measurements, tracked.assignments)
     done = time.perf_counter()
     called = _called(plots.sources, sensors.names)
+    found = len(tracked.assignments.confirmed)
     problems += [
-        *_without_tracks(plots, sensors, tracked),
+        *(_without_tracks(plots, sensors, tracked) if found else [why_no_track(sensors, tracked, config.tracker)]),
         *address_lines(whole, called),
         *conflict_lines(whole, called),
     ]
