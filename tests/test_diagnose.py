@@ -220,7 +220,7 @@ def test_two_recordings_of_the_same_aircraft(tmp_path, rng):
     [
         ([], "either --reference RECORDING, or --columns"),
         (["--columns", "up"], "no column 'up'; there are time, east, name"),
-        (["--columns", "name"], "column 'name' holds string"),
+        (["--columns", "name"], "row 0, column 'name': 'a' is no number"),
         (["--columns", "east"], "too few"),
     ],
 )

@@ -262,11 +262,11 @@ def test_what_cannot_be_scored_is_one_line(tmp_path):
     assert "is a folder; name a table" in said(tmp_path, tmp_path)
     assert "absent.parquet: no such file" in said(tmp_path, tmp_path / "absent.parquet")
     (tmp_path / "ragged.csv").write_text("time,target_id,latitude,longitude\n1,a,2,3\n4,a,5\n")
-    assert "row 1 has 3 cells where the header has 4" in said(tmp_path, tmp_path / "ragged.csv")
+    assert "row 1: 3 cells where the header has 4" in said(tmp_path, tmp_path / "ragged.csv")
     (tmp_path / "empty.csv").write_text("")
     assert "it is empty" in said(tmp_path, tmp_path / "empty.csv")
     (tmp_path / "truth.parquet").write_bytes(b"nothing")
-    assert "no readable table" in said(tmp_path, tmp_path / "truth.parquet")
+    assert "no readable Parquet table" in said(tmp_path, tmp_path / "truth.parquet")
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])

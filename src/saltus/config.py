@@ -24,6 +24,7 @@ system = "platform"               # optional: sources of one system make common 
 [editions]
 21 = "0.23"                       # category = edition; others are guessed
 
+[reading]                         # fields of saltus.io.ReadingSettings
 [tracker]                         # fields of saltus.tracks.settings.TrackerSettings
 [filter]                          # fields of saltus.tracks.settings.FilterSettings
 [systems]                         # fields of saltus.tracks.settings.SystemsSettings
@@ -43,6 +44,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 from saltus.asterix.layout import editions as known_editions
 from saltus.errors import ModelError
 from saltus.framing import NAMES
+from saltus.io.settings import ReadingSettings
 from saltus.records import System
 from saltus.text import brief, cut, shown
 from saltus.toml import load_toml
@@ -72,7 +74,7 @@ _HINTS = {
 }
 
 _YEARS = 1970, 2100  # of a recording: times count from the first, reports after the last are out of range
-T = TypeVar("T", TrackerSettings, FilterSettings, SystemsSettings, RegistrationSettings)
+T = TypeVar("T", ReadingSettings, TrackerSettings, FilterSettings, SystemsSettings, RegistrationSettings)
 _Octet = Annotated[int, Field(ge=0, le=255)]
 _Sigma = Annotated[float, Field(gt=0.0, le=1e4)]
 
@@ -128,6 +130,7 @@ class Config(BaseModel):
     framing: str | None = None
     sensor: tuple[SensorConfig, ...] = ()
     editions: dict[int, str] = Field(default_factory=dict)
+    reading: ReadingSettings = Field(default_factory=ReadingSettings)
     tracker: TrackerSettings = Field(default_factory=TrackerSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
     systems: SystemsSettings = Field(default_factory=SystemsSettings)
@@ -162,6 +165,7 @@ def _load(path: Path | str) -> Config:
     content = load_toml(path)
     _known(path, "", content, Config.model_fields)
     values: dict[str, object] = {
+        "reading": _settings(path, "reading", content.get("reading", {}), ReadingSettings),
         "tracker": _settings(path, "tracker", content.get("tracker", {}), TrackerSettings),
         "filter": _settings(path, "filter", content.get("filter", {}), FilterSettings),
         "systems": _settings(path, "systems", content.get("systems", {}), SystemsSettings),

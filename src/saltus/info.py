@@ -42,7 +42,7 @@ def show_info(inputs: Sequence[Path], config_path: Path | None, date: str | None
         ModelError: the configuration or the date is wrong.
     """
     config = load_config(config_path, date=date, framing=framing)
-    told = Told(config.date, config.editions, config.framing)
+    told = Told(config.date, config.editions, config.framing, config.reading)
     parts: list[Part] = []
     failures: dict[str, SaltusError | OSError] = {}
     for path in expand(inputs):

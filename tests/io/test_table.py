@@ -103,7 +103,8 @@ def test_parquet_types(tmp_path):
     )
     assert got.plots.time[0] == NOON + 0.5
     assert (got.plots.on_ground[0], got.plots.icao24[0]) == (1, 0xABCDEF)
-    assert got.contents[0].notes == ("columns not used: extra",)
+    assert got.contents[0].notes == ("1 times without an offset are taken as UTC",)
+    assert got.problems == ("t.parquet: columns not used: extra (1 values).",)
 
 
 def test_rows_in_any_order(tmp_path):
@@ -264,8 +265,8 @@ def test_kinds_stated_and_bearings(tmp_path):
     assert got.plots.kind.tolist() == [polar, plane, bearing, bearing, polar, polar]
     found = reasons(got)
     assert [found[k] for k in (2, 3, 4)] == ["", "", "not a number"]
-    assert "row 3: no range_m" in got.problems[0]
-    assert "row 5, column 'kind': 'sonar' is no kind" in got.problems[1]
+    assert "row 5, column 'kind': 'sonar' is no kind" in got.problems[0]
+    assert "row 3: no range_m" in got.problems[1]
 
 
 def test_a_range_that_is_no_number_makes_no_bearing_of_a_radar_plot(tmp_path):

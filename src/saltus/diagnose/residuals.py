@@ -11,8 +11,11 @@ from saltus import io
 from saltus.config import Config
 from saltus.errors import DataError
 from saltus.geo import Site
+from saltus.io.cells import numbers, refuse, texts, times
+from saltus.io.sheet import read_sheet
 from saltus.records import Kind, Plots
 from saltus.shapes import Float
+from saltus.text import cut
 from saltus.tracks.measurements import default_noise, make_plane, place_plots
 
 __all__ = ["Phase", "Residuals", "from_recordings", "from_table"]
@@ -42,32 +45,21 @@ def from_table(path: Path, columns: Sequence[str], series: str | None) -> Residu
     Raises:
         DataError: a column is missing or holds no numbers; the message lists what there is.
     """
-    import pyarrow as pa
-    import pyarrow.compute as pc
-    import pyarrow.csv as csv
-    import pyarrow.parquet as pq
-
-    try:
-        with path.open("rb") as file:
-            table = pq.read_table(file) if path.suffix.lower() in (".parquet", ".pq") else csv.read_csv(file)
-    except pa.ArrowInvalid as error:
-        raise DataError(f"{path}: is no table: {error}") from None
     wanted = ["time", *columns] + ([series] if series is not None else [])
-    missing = [name for name in wanted if name not in table.column_names]
+    sheet = read_sheet(path, wanted)
+    missing = [name for name in wanted if name not in sheet.columns]
     if missing:
-        raise DataError(f"{path}: no column {missing[0]!r}; there are {', '.join(table.column_names)}.")
-    time = table["time"]
-    if pa.types.is_timestamp(time.type):
-        time = pc.divide(pc.cast(pc.cast(time, pa.timestamp("us")), pa.int64()).cast(pa.float64()), 1e6)
-    numbers = []
-    for name, column in [("time", time), *((name, table[name]) for name in columns)]:
-        if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-            raise DataError(f"{path}: column {name!r} holds {column.type}, not numbers.")
-        numbers.append(np.asarray(column.cast(pa.float64()).to_numpy(zero_copy_only=False), np.float64))
-    labels = np.zeros(table.num_rows, np.int64)
+        there = ", ".join(cut(name, 40) for name in [*sheet.columns, *sheet.unused])
+        raise DataError(f"{path}: no column {missing[0]!r}; there are {there}.")
+    faults: list[str] = [*sheet.problems]
+    values = [times(path, sheet.columns["time"], faults)]
+    values += [numbers(path, name, sheet.columns[name], faults) for name in columns]
     if series is not None:
-        labels = np.asarray(table[series].combine_chunks().dictionary_encode().indices.fill_null(-1)).astype(np.int64)
-    return _distinct(Residuals(tuple(columns), numbers[0], np.stack(numbers[1:], axis=-1), labels, ""))
+        labels = texts(path, series, sheet.columns[series], faults).which
+    else:
+        labels = np.zeros(sheet.n_rows, np.int64)
+    refuse(path, faults)
+    return _distinct(Residuals(tuple(columns), values[0], np.stack(values[1:], axis=-1), labels, ""))
 
 
 def from_recordings(
@@ -82,7 +74,13 @@ def from_recordings(
         DataError: a file cannot be read, a site is not configured, no address occurs in both, or both say the same.
     """
     seen, truth = (
-        io.read(list(paths), date=config.date, editions=config.editions, framing=config.framing).plots
+        io.read(
+            list(paths),
+            date=config.date,
+            editions=config.editions,
+            framing=config.framing,
+            settings=config.reading,
+        ).plots
         for paths in (inputs, reference)
     )
     if phase != "all":

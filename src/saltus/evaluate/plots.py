@@ -6,10 +6,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from saltus.errors import DataError
 from saltus.evaluate.reference import Reference
+from saltus.io.cells import numbers
+from saltus.io.sheet import read_sheet
 from saltus.records import Plots
 
 __all__ = ["KNOT", "OWN_RUN", "Followed", "Motion", "downlinked", "followed", "from_run", "simulated"]
@@ -79,17 +80,16 @@ def downlinked(plots: Plots, path: Path) -> Motion:
     if not path.is_file():
         raise DataError(f"{path}: no such file.")
     try:
-        with path.open("rb") as file:
-            table = pq.read_table(file)
-    except (pa.ArrowException, OSError) as error:
+        table = read_sheet(path, _COLUMNS).columns
+    except DataError as error:
         raise DataError(
-            f"{path}: no Parquet table. A reference is one of the same plots with what aircraft downlinked (BDS 5,0), "
+            f"{error} A reference is a table of the same plots with what aircraft downlinked (BDS 5,0), "
             f"in columns {', '.join(_COLUMNS)}."
         ) from error
-    missing = [name for name in _COLUMNS if name not in table.schema.names]
+    missing = [name for name in _COLUMNS if name not in table]
     if missing:
         raise DataError(f"{path}: no column {', '.join(missing)}; a reference has {', '.join(_COLUMNS)}.")
-    t, rho, theta, course, roll, knots = (np.asarray(table[n].to_numpy(), np.float64) for n in _COLUMNS)
+    t, rho, theta, course, roll, knots = (numbers(path, name, table[name], []) for name in _COLUMNS)
     row = {key: k for k, key in enumerate(_keys(t, rho * 1852.0, np.radians(theta)))}
     usable = plots.reason == 0
     at = np.array([row.get(key, -1) for key in _keys(plots.time, plots.range, plots.azimuth)])

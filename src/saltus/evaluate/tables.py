@@ -1,20 +1,19 @@
 """Truth and tracks from tables."""
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from saltus.errors import DataError
 from saltus.evaluate.matching import Tracks
 from saltus.evaluate.reference import Reference, each_time_once, make_reference
 from saltus.geo import geodetic_to_ecef
+from saltus.io.cells import numbers, refuse, texts
 from saltus.io.merge import LIMITS
-from saltus.io.table import csv_as_text
+from saltus.io.sheet import read_sheet
 
 __all__ = ["read_reference", "read_tracks", "reference_of", "tracks_of"]
 
@@ -37,7 +36,7 @@ def read_reference(path: Path) -> Reference:
     Raises:
         DataError: no such table, no row, a column is missing, or a value is absent or cannot be.
     """
-    table = _table(path, ("time", "target_id", "latitude", "longitude"))
+    table = _table(path, ("time", "target_id", "latitude", "longitude"), ("altitude", "ve", "vn", "turning"))
     if not table.num_rows:
         raise DataError(f"{path}: the truth has columns and no row.")
     return reference_of(table, path)
@@ -49,7 +48,7 @@ def reference_of(table: pa.Table, path: Path = Path("truth")) -> Reference:
     Raises:
         DataError: a value is absent or cannot be.
     """
-    label = np.array([str(v) for v in table["target_id"].to_pylist()], object)
+    label = np.array(_words(path, table, "target_id"), object)
     time, latitude, longitude = (_checked(path, _column(path, table, c), c) for c in _CAN_BE)
 
     def told(name: str) -> _Array:
@@ -95,7 +94,7 @@ def tracks_of(table: pa.Table, path: Path = Path("tracks"), statuses: Sequence[s
     Raises:
         DataError: a column does not hold numbers.
     """
-    live = np.isin(np.array(table["status"].to_pylist(), object).astype(str), statuses)
+    live = np.isin(_words(path, table, "status"), statuses)
     ids, time, latitude, longitude, ee, en, nn = (_column(path, table, c)[live] for c in _NUMBERS)
     cov = np.stack([np.stack([ee, en], axis=-1), np.stack([en, nn], axis=-1)], axis=-2)
     keep = each_time_once(ids.astype(np.int64), time)
@@ -103,42 +102,27 @@ def tracks_of(table: pa.Table, path: Path = Path("tracks"), statuses: Sequence[s
     return Tracks(ids[keep].astype(np.int64), time[keep], place, cov[keep])
 
 
-def _table(path: Path, needed: Sequence[str]) -> pa.Table:
+def _table(path: Path, needed: Sequence[str], further: Sequence[str] = ()) -> pa.Table:
     if not path.is_file():
         raise DataError(f"{path}: {'is a folder; name a table' if path.is_dir() else 'no such file'}.")
-    try:
-        with path.open("rb") as file:
-            table = csv_as_text(path) if path.suffix.lower() == ".csv" else pq.read_table(file)
-    except pa.ArrowException as error:
-        said = _ragged(path) if path.suffix.lower() == ".csv" else str(error).splitlines()[0]
-        raise DataError(f"{path}: no readable table: {said}") from error
-    missing = [c for c in needed if c not in table.column_names]
+    sheet = read_sheet(path, (*needed, *further))
+    missing = [c for c in needed if c not in sheet.columns]
     if missing:
         raise DataError(f"{path}: no column {missing[0]!r}; needed are {', '.join(needed)}.")
-    return table
-
-
-def _ragged(path: Path) -> str:
-    """Say which row of a CSV file that cannot be read has another number of cells than the header."""
-    lines = list(csv.reader(path.read_text(encoding="utf-8", errors="replace").splitlines()))
-    for k, cells in enumerate(lines[1:]):
-        if len(cells) != len(lines[0]):
-            return f"row {k} has {len(cells)} cells where the header has {len(lines[0])}."
-    return "it is empty, or not UTF-8 text with a header and one row a line."
+    refuse(path, sheet.problems)
+    return pa.table(sheet.columns)
 
 
 def _column(path: Path, table: pa.Table, name: str) -> _Array:
-    """Numbers, NaN where a cell is empty; text that holds them is read."""
-    column = table[name]
-    if not pa.types.is_string(column.type):
-        try:
-            return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), np.float64)
-        except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-            raise DataError(f"{path}: column {name!r} is of type {column.type}; it must hold numbers.") from error
-    values = np.full(len(column), np.nan)
-    for k, text in enumerate(column.to_pylist()):
-        try:
-            values[k] = float(text) if text else np.nan
-        except ValueError as error:
-            raise DataError(f"{path}: row {k}, column {name!r}: {text!r} is no number.") from error
+    """Numbers, NaN where a cell is empty; text that holds them is read, and one that does not is refused."""
+    faults: list[str] = []
+    values = numbers(path, name, table[name], faults)
+    refuse(path, faults)
     return values
+
+
+def _words(path: Path, table: pa.Table, name: str) -> list[str]:
+    faults: list[str] = []
+    found = texts(path, name, table[name], faults)
+    refuse(path, faults)
+    return [str(v) for v in found.each({v: v for v in found.values}, "", object)]

@@ -10,9 +10,12 @@ from saltus.framing.capture import MAGIC
 from saltus.io.inputs import expand
 from saltus.io.merge import merge
 from saltus.io.part import Part, printable
+from saltus.io.settings import ReadingSettings
 from saltus.records import Recording
 
-__all__ = ["FORMATS", "Format", "Told", "format_of", "read", "read_part"]
+__all__ = ["FORMATS", "Format", "ReadingSettings", "Told", "format_of", "read", "read_part"]
+
+_PER_BYTE = 80.0  # bytes that a byte of ASTERIX takes while it is read and merged, measured; see docs/formats.md
 
 Progress = Callable[[str, float], None]
 Reader = Callable[[Path, "Told", Progress | None], Part]
@@ -24,6 +27,7 @@ class Told(NamedTuple):
     date: datetime.date | None = None  # of the first record of ASTERIX files; past midnight counts on
     editions: Mapping[int, str] = {}  # ASTERIX category -> edition, as "0.23"; categories not named are guessed
     framing: str | None = None  # one of `saltus.framing.NAMES`; None has it guessed
+    settings: ReadingSettings = ReadingSettings()  # bounds of reading
 
 
 class Format(NamedTuple):
@@ -37,29 +41,25 @@ class Format(NamedTuple):
 
 def _asterix(path: Path, told: Told, progress: Progress | None) -> Part:
     from saltus.io.asterix import read_asterix
+    from saltus.io.sheet import refuse_size
 
+    size = path.stat().st_size
+    refuse_size(path, size * _PER_BYTE, told.settings.memory, f"{size / 1e6:.4g} MB of ASTERIX")
     return read_asterix(path, date=told.date, editions=told.editions, framing=told.framing, progress=progress)
 
 
-def _csv(path: Path, told: Told, progress: Progress | None) -> Part:
-    del told, progress
-    from saltus.io.table import read_csv
+def _table(path: Path, told: Told, progress: Progress | None) -> Part:
+    del progress
+    from saltus.io.table import read_table
 
-    return read_csv(path)
-
-
-def _parquet(path: Path, told: Told, progress: Progress | None) -> Part:
-    del told, progress
-    from saltus.io.table import read_parquet
-
-    return read_parquet(path)
+    return read_table(path, told.settings)
 
 
 FORMATS = (
-    Format("Parquet table", (".parquet", ".pq"), (b"PAR1",), _parquet),
+    Format("Parquet table", (".parquet", ".pq"), (b"PAR1",), _table),
     Format("packet capture", (".pcap", ".pcapng", ".cap"), MAGIC, _asterix),
     Format("ASTERIX", (".ast", ".raw", ".asterix"), (), _asterix),
-    Format("CSV table", (".csv",), (), _csv),
+    Format("CSV table", (".csv",), (), _table),
 )
 _ASTERIX, _CSV = FORMATS[2:]
 
@@ -71,6 +71,7 @@ def read(
     editions: Mapping[int, str] | None = None,
     framing: str | None = None,
     progress: Progress | None = None,
+    settings: ReadingSettings | None = None,
 ) -> Recording:
     """Read files and merge them by time.
 
@@ -84,13 +85,14 @@ def read(
         editions: ASTERIX category -> edition, as "0.23"; categories not named are guessed.
         framing: of ASTERIX files, one of `saltus.framing.NAMES`; None has it guessed.
         progress: called with a file's name and the fraction read.
+        settings: bounds of reading.
 
     Raises:
-        DataError: a file is empty, of unknown format or without one readable record.
+        DataError: a file is empty, of unknown format, without one readable record, or larger than the settings allow.
     """
     if not paths:
         raise DataError("no input given: name at least one recording.")
-    told = Told(date, editions or {}, framing)
+    told = Told(date, editions or {}, framing, settings or ReadingSettings())
     return merge([read_part(path, told, progress) for path in expand(paths)])
 
 

@@ -101,7 +101,12 @@ def write_tracks(
     began = time.perf_counter()
     config = load_config(config_path, date=date_text, framing=framing)
     recording = io.read(
-        inputs, date=config.date, editions=config.editions, framing=config.framing, progress=bar.reading
+        inputs,
+        date=config.date,
+        editions=config.editions,
+        framing=config.framing,
+        progress=bar.reading,
+        settings=config.reading,
     )
     decoded = time.perf_counter()
     plots, sensors, problems = _prepare(recording, config, time_from, time_to)
