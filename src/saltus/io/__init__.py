@@ -12,6 +12,7 @@ from saltus.io.merge import merge
 from saltus.io.part import Part, printable
 from saltus.io.settings import ReadingSettings
 from saltus.records import Recording
+from saltus.text import brief
 
 __all__ = ["FORMATS", "Format", "ReadingSettings", "Told", "format_of", "read", "read_part"]
 
@@ -119,19 +120,22 @@ def format_of(path: Path, framing: str | None = None) -> Format:
         if head.startswith(entry.magic):
             return entry
     from saltus.io.blocks import looks_like_asterix
+    from saltus.io.foreign import foreign, is_plain
 
-    if not (path.suffix.lower() in _CSV.suffixes and _is_text(head)) and looks_like_asterix(head):
+    known = foreign(head)
+    if known is not None:
+        raise DataError(f"{path}: {known.name}: known, and not read. {known.remedy}")
+    plain = is_plain(head)
+    if not plain and looks_like_asterix(head):
         return _ASTERIX
     for entry in FORMATS:
         if path.suffix.lower() in entry.suffixes:
             return entry
-    known = "; ".join(f"{entry.name} ({', '.join(entry.suffixes)})" for entry in FORMATS)
-    raise DataError(
-        f"{path}: unknown format: it begins with {head[:8].hex(' ')} and not with an ASTERIX block. Known: {known}. "
-        "ASTERIX in a recorder's container is recognised by its structure; --framing NAME insists on one."
-    )
-
-
-def _is_text(head: bytes) -> bool:
-    """Whether bytes hold no control characters: no block of ASTERIX is without, and some digits make a container."""
-    return not any(byte < 32 and byte not in b"\t\n\r" for byte in head)
+    formats = "; ".join(f"{entry.name} ({', '.join(entry.suffixes)})" for entry in FORMATS)
+    if plain:
+        begins = brief(head[:40].decode("utf-8", "replace").split("\n")[0])
+        advice = "It is text: of text, tables are read that have the suffix .csv and a header line."
+    else:
+        begins = f"{head[:8].hex(' ')} and not with an ASTERIX block"
+        advice = "ASTERIX in a recorder's container is told by its structure; --framing NAME insists on one."
+    raise DataError(f"{path}: unknown format: it begins with {begins}. Known: {formats}. {advice}")
