@@ -496,3 +496,17 @@ def test_a_site_for_each_report_places_it_as_that_site_alone(kind, rng):
         alone = place(np.array([k]), geo.Site(lat[k], lon[k], h[k], 5.0))
         for a, b in zip(together, alone, strict=True):
             np.testing.assert_allclose(a[k], b[0], rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, np.pi - 0.01, np.pi, -np.pi, 2.0 * np.pi, 100.0])
+def test_circular_means_do_not_depend_on_where_angles_are_cut(turn):
+    angle = np.array([-0.3, -0.1, 0.0, 0.05, 0.4])
+    assert abs(geo.wrap(geo.circular_mean(angle + turn) - turn - angle.mean())) < 1e-12
+    assert abs(geo.wrap(geo.circular_median(geo.wrap(angle + turn)) - turn)) < 1e-12
+    assert -np.pi <= geo.circular_mean(angle + turn) < np.pi
+
+
+def test_a_scene_across_the_antimeridian_is_the_scene_elsewhere():
+    longitude = np.radians([179.9, -179.9, 179.95, -179.7, -179.8])
+    assert geo.circular_median(longitude) == pytest.approx(np.radians(-179.9), abs=1e-12)
+    assert abs(geo.circular_mean(np.radians([359.0, 1.0]))) < 1e-12

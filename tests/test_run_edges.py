@@ -96,3 +96,23 @@ def _good(tmp_path):
 def test_settings_that_cannot_be_are_refused(setting):
     with pytest.raises(ModelError, match=f"tracker.{next(iter(setting))}.* must be positive and finite"):
         TrackerSettings(**setting)
+
+
+def test_a_scene_across_180_degrees_is_the_scene_elsewhere(tmp_path, rng):
+    noise = 3e-4 * rng.standard_normal((3, 40, 2))
+
+    def tracked(middle, name):
+        rows = []
+        for j in range(3):
+            for k in range(40):
+                longitude = (middle + 0.004 * (k - 20) + 0.3 * (j - 1) + noise[j, k, 0] + 180.0) % 360.0 - 180.0
+                rows.append(f"{START + 4.0 * k},{20 + 0.1 * j + noise[j, k, 1]:.9f},{longitude:.9f},{0x400000 + j:06x}")
+        (tmp_path / f"{name}.csv").write_text("time,latitude,longitude,icao24\n" + "\n".join(rows) + "\n")
+        track_files([tmp_path / f"{name}.csv"], tmp_path / name)
+        return pq.read_table(tmp_path / name / "tracks.parquet")
+
+    across, elsewhere = tracked(180.0, "across"), tracked(10.0, "elsewhere")
+    assert len(set(across["track_id"].to_pylist())) == 3
+    moved = (np.array(across["longitude"]) - 170.0 + 180.0) % 360.0 - 180.0
+    np.testing.assert_allclose(moved, np.array(elsewhere["longitude"]), atol=1e-7)
+    np.testing.assert_allclose(np.array(across["latitude"]), np.array(elsewhere["latitude"]), atol=1e-7)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from saltus.errors import DataError
 from saltus.evaluate import Reference, Tracks, target_scores
 from saltus.evaluate.tables import read_reference, read_tracks
-from saltus.geo import ecef_to_geodetic
+from saltus.geo import circular_mean, ecef_to_geodetic, wrap
 from saltus.io.publish import settle
 from saltus.io.write import output_file, write_json
 from saltus.text import say
@@ -71,7 +71,9 @@ def _utc(seconds: float) -> str:
 
 
 def _area(place: _Array) -> str:
-    latitude, longitude = (np.degrees(a) for a in ecef_to_geodetic(place)[:2])
+    latitude, longitude = ecef_to_geodetic(place)[:2]
+    centre = circular_mean(longitude)  # so that an area across 180 degrees is no belt round the earth
+    latitude, longitude = np.degrees(latitude), np.degrees(centre + wrap(longitude - centre))
     return (
         f"latitude {latitude.min():.4g} to {latitude.max():.4g} "
         f"and longitude {longitude.min():.4g} to {longitude.max():.4g}"

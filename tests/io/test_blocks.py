@@ -136,6 +136,8 @@ def test_links_vlan_and_what_is_passed_over(tmp_path):
     assert len(got.plots) == 1
     assert any("1 UDP payloads are not ASTERIX" in p for p in got.problems)
     assert any("1 parts of fragmented IP packets" in p for p in got.problems)
+    over = "a.pcap: 2 packets passed over, without ASTERIX: 1 of ARP, 1 of UDP to port 8600, no ASTERIX."
+    assert over in got.problems
     cooked = bytes(14) + udp(PLOT)[12:]
     assert len(read([write(tmp_path, classic([cooked], link=113), "b.pcap")]).plots) == 1
     raw = udp(PLOT)[14:]
@@ -160,6 +162,25 @@ def test_pcapng(tmp_path):
     cut = read([write(tmp_path, data + b"\x06\0\0\0\xff", "b.pcapng")])
     assert len(cut.plots) == 1
     assert f"byte {len(data)}" in cut.problems[0]
+
+
+def ip(protocol, rest, version=4):
+    """Ethernet and IP around what a protocol carries."""
+    if version == 6:
+        return bytes(12) + b"\x86\xdd" + struct.pack(">IHBB", 6 << 28, len(rest), protocol, 64) + bytes(32) + rest
+    head = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + len(rest), 0, 0, 64, protocol, 0, bytes(4), bytes(4))
+    return bytes(12) + b"\x08\x00" + head + rest
+
+
+def test_packets_passed_over_are_counted_by_protocol(tmp_path):
+    frames = [udp(PLOT), *[ip(6, bytes(20))] * 3, ip(1, bytes(8)), ip(200, bytes(8))]
+    frames += [ip(17, udp(PLOT)[34:], 6), bytes(12) + b"\x88\xcc" + bytes(20), bytes(12) + b"\x12\x34" + bytes(20)]
+    got = read([write(tmp_path, classic(frames), "a.pcap")])
+    assert got.contents[0].n_records == 2
+    over = next(p for p in got.problems if "passed over" in p)
+    assert over.startswith("a.pcap: 7 packets passed over, without ASTERIX: 3 of TCP, ")
+    for what in ("1 of ICMP", "1 of IP protocol 200", "1 of LLDP", "1 of Ethernet type 0x1234"):
+        assert what in over
 
 
 def test_capture_cut_at_every_byte(tmp_path):

@@ -59,6 +59,6 @@ def test_every_column_that_is_not_used_is_named_and_counted(tmp_path):
 
 
 def test_a_table_without_time_says_which_column_may_be_it(tmp_path):
-    (tmp_path / "t.csv").write_text("MMSI,BaseDateTime,LAT,LON\n1,2024-05-01T12:00:00,41,2\n")
+    (tmp_path / "t.csv").write_text("ship,BaseDateTime,LAT,LON\n1,2024-05-01T12:00:00,41,2\n")
     with pytest.raises(DataError, match=r"no column for time.*For BaseDateTime write time.*For LAT write latitude"):
         read([tmp_path / "t.csv"])

@@ -7,6 +7,8 @@ Heights above mean sea level and pressure altitudes are taken as heights above t
 from saltus.geo.earth import (
     Site,
     Sites,
+    circular_mean,
+    circular_median,
     ecef_to_geodetic,
     geodetic_to_ecef,
     geodetic_to_polar,
@@ -32,6 +34,8 @@ __all__ = [
     "Site",
     "Sites",
     "TrueState",
+    "circular_mean",
+    "circular_median",
     "ecef_to_geodetic",
     "geodetic_to_ecef",
     "geodetic_to_plane",

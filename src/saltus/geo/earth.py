@@ -11,6 +11,8 @@ from saltus.shapes import Float
 __all__ = [
     "Site",
     "Sites",
+    "circular_mean",
+    "circular_median",
     "ecef_to_geodetic",
     "geodetic_to_ecef",
     "geodetic_to_polar",
@@ -33,6 +35,27 @@ def wrap(angle: npt.ArrayLike) -> Float[np.ndarray, "*lead"]:
     # Round-off may leave a value next to the edge on its wrong side.
     turned = np.where((turned >= np.pi) | (turned < -np.pi), -np.pi, turned)
     return np.where((a >= -np.pi) & (a < np.pi), a, turned)
+
+
+def circular_mean(angle: npt.ArrayLike) -> float:
+    """Mean of angles (rad) that lie within half a circle, in [-pi, pi): that of their distances from one direction.
+
+    The direction is that of the sum of their unit vectors, so nothing depends on where angles are cut.
+    """
+    a = np.asarray(angle, np.float64)
+    centre = _direction(a)
+    return float(wrap(centre + np.mean(wrap(a - centre))))
+
+
+def circular_median(angle: npt.ArrayLike) -> float:
+    """Median of angles (rad), in [-pi, pi), counted like `circular_mean`: some may lie anywhere."""
+    a = np.asarray(angle, np.float64)
+    centre = _direction(a)
+    return float(wrap(centre + np.median(wrap(a - centre))))
+
+
+def _direction(angle: npt.NDArray[np.float64]) -> float:
+    return float(np.arctan2(np.sin(angle).sum(), np.cos(angle).sum()))
 
 
 @dataclass(frozen=True, slots=True)

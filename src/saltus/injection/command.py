@@ -64,7 +64,9 @@ def study_faults(
     with output_directory(output, "study") as folder:
         if recordings:
             config = load_config(config_path, date=date, framing=framing)
-            recording = io.read(recordings, date=config.date, editions=config.editions, framing=config.framing, settings=config.reading)
+            recording = io.read(
+                recordings, date=config.date, editions=config.editions, framing=config.framing, settings=config.reading
+            )
             truth = None if reference is None else downlinked(recording.plots, reference)
         else:
             recording, config, truth = _scene(folder, seed)

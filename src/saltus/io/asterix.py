@@ -60,6 +60,9 @@ def read_asterix(
     if not path.stat().st_size:
         raise DataError(f"{path}: byte 0: the file is empty.")
     problems = list(told.problems)
+    over = ", ".join(f"{n} of {what}" for what, n in told.passed.items())
+    if over:
+        problems.append(f"{name}: {sum(told.passed.values())} packets passed over, without ASTERIX: {over}.")
     notes: dict[int, tuple[str, ...]] = {}
     found: dict[int, Found] = {}
     unread = []
@@ -84,8 +87,7 @@ def read_asterix(
         part = assemble(name, found, notes, problems, date if date or not blocks.dated else "capture clock")
         return part._replace(contents=(*part.contents, *unread))
     if not unread:
-        over = ", ".join(f"{n} of {what}" for what, n in told.passed.items())
-        said = (f" {problems[0]}" if problems else "") + (f" Passed over: {over}." if over else "")
+        said = f" {problems[0]}" if problems else ""
         raise DataError(f"{path}: no ASTERIX record could be read: wrong format, category or edition?{said}")
     return Part(Plots.build(0, (), (name,), {}), None, tuple(unread), tuple(problems), True, blocks.dated)
 

@@ -14,6 +14,8 @@ from saltus.geo import (
     PlanePositions,
     Site,
     Sites,
+    circular_mean,
+    circular_median,
     ecef_to_geodetic,
     geodetic_to_ecef,
     geodetic_to_plane,
@@ -155,8 +157,8 @@ class Measurements:
         a, b = left[:, None], used[None, :]
         flown = speed * np.abs(self.time[a] - self.time[b])
         reach = np.minimum(max_range, _HULL + _RESOLUTION * self._deviation(left)[:, None] + flown)
-        d_range, d_azimuth = np.moveaxis(np.abs(self.polar[a] - self.polar[b]), -1, 0)
-        d_azimuth = np.minimum(d_azimuth, 2.0 * np.pi - d_azimuth)
+        d_range, d_azimuth = np.moveaxis(self.polar[a] - self.polar[b], -1, 0)
+        d_range, d_azimuth = np.abs(d_range), np.abs(wrap(d_azimuth))
         distance = np.linalg.norm(self.position[a, :2] - self.position[b, :2], axis=-1)
         near = np.where(np.isnan(d_range), distance < reach, (d_range < reach) & (d_azimuth < max_azimuth))
         apart = np.abs(self.position[a, 2] - self.position[b, 2]) > _SAME_HEIGHT
@@ -180,8 +182,7 @@ def make_plane(plots: Plots, sites: Sequence[Site | None]) -> Plane:
     """
     known = [s for s in sites if s is not None]
     if known:
-        east = known[0].longitude + wrap([s.longitude - known[0].longitude for s in known])  # also across 180 degrees
-        return Plane(float(np.mean([s.latitude for s in known])), float(wrap(np.mean(east))))
+        return Plane(float(np.mean([s.latitude for s in known])), circular_mean([s.longitude for s in known]))
     at = (plots.kind == Kind.GEODETIC) & (plots.reason == 0)
     moved = np.isfinite(plots.observer_latitude) & (plots.reason == 0)
     if not at.any() and moved.any():
@@ -195,7 +196,7 @@ def make_plane(plots: Plots, sites: Sequence[Site | None]) -> Plane:
 
 
 def _about(latitude: _Array, longitude: _Array) -> Plane:
-    return Plane(float(np.median(latitude)), float(np.median(longitude)))
+    return Plane(float(np.median(latitude)), circular_median(longitude))
 
 
 def place_plots(
