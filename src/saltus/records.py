@@ -33,6 +33,7 @@ REASONS = (
     "site unknown",  # the source needs a site position and none is configured
     "system track",  # CAT062: another system's track, never used as a plot
     "broken row",  # of a table: more or fewer cells than the header
+    "impossible time of day",  # past the end of the day
 )
 
 

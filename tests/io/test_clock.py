@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from saltus.io.clock import DAY, complete, day_offsets, order_faults
+from saltus.io.clock import DAY, complete, day_offsets, impossible, order_faults, standing, told_clock
 
 
 def test_midnight_counts_on():
@@ -35,14 +35,14 @@ def test_wild_first_time_starts_no_day():
 
 def test_within_the_window_all_is_well():
     time = np.array([0.0, 1.9, 0.0, 3.0, 1.0, 4.0])
-    late, jump, steps = order_faults(time)
+    late, jump, steps, *_ = order_faults(time)
     assert not late.any() and not jump.any() and steps == ()
 
 
 def test_a_late_report_is_late_and_nothing_else():
     time = np.arange(0.0, 60.0)
     time[30] = 20.0
-    late, jump, steps = order_faults(time)
+    late, jump, steps, *_ = order_faults(time)
     assert np.flatnonzero(late).tolist() == [30]
     assert not jump.any() and steps == ()
 
@@ -52,7 +52,7 @@ def test_a_late_report_is_late_and_nothing_else():
 def test_one_wild_time_does_not_touch_its_neighbours(wild, where):
     time = np.arange(1000.0, 1060.0)
     time[where] += wild
-    late, jump, steps = order_faults(time)
+    late, jump, steps, *_ = order_faults(time)
     expected = [where]
     if where == 59 and wild == 100.0:
         expected = []  # the last report of a file 100 s ahead may as well follow a gap
@@ -64,14 +64,14 @@ def test_one_wild_time_does_not_touch_its_neighbours(wild, where):
 
 def test_a_gap_is_no_fault():
     time = np.concatenate([np.arange(0.0, 50.0), np.arange(5000.0, 5050.0)])
-    late, jump, steps = order_faults(time)
+    late, jump, steps, *_ = order_faults(time)
     assert not late.any() and not jump.any() and steps == ()
 
 
 def test_a_clock_set_back_for_good_keeps_the_rest():
     """40 s after the start it is set back by 10 s: what it repeats, 30 to 40 s, is dropped from the earlier part."""
     time = np.concatenate([np.arange(0.0, 40.0, 0.1), np.arange(30.0, 80.0, 0.1)])
-    late, jump, steps = order_faults(time)
+    late, jump, steps, *_ = order_faults(time)
     assert steps == (400,)
     assert not late.any() and not jump[400:].any()
     assert np.flatnonzero(jump).tolist() == list(range(300, 400))
@@ -79,7 +79,7 @@ def test_a_clock_set_back_for_good_keeps_the_rest():
 
 def test_a_clock_set_back_before_the_start_loses_nothing():
     time = np.concatenate([np.arange(3600.0, 3700.0), np.arange(0.0, 100.0)])
-    late, jump, steps = order_faults(time)
+    late, jump, steps, *_ = order_faults(time)
     assert steps == (100,)
     assert not late.any() and not jump.any()
 
@@ -88,7 +88,7 @@ def test_a_clock_set_back_before_the_start_loses_nothing():
 @pytest.mark.parametrize("order", [(1, 0, 2), (2, 0, 1), (0, 2, 1), (2, 1, 0)])
 def test_stretches_out_of_order_lose_nothing(period, order):
     stretches = np.split(period * np.arange(900.0), 3)
-    late, jump, steps = order_faults(np.concatenate([stretches[k] for k in order]))
+    late, jump, steps, *_ = order_faults(np.concatenate([stretches[k] for k in order]))
     assert not late.any() and not jump.any()
     assert steps
 
@@ -96,7 +96,7 @@ def test_stretches_out_of_order_lose_nothing(period, order):
 def test_a_sparse_clock_set_back_drops_what_it_repeats():
     """One report every 2 s: the intervals between the later reports are no silence."""
     time = np.concatenate([np.arange(0.0, 200.0, 2.0), np.arange(101.0, 400.0, 2.0)])
-    late, jump, steps = order_faults(time)
+    late, jump, steps, *_ = order_faults(time)
     assert steps == (100,)
     assert time[jump].tolist() == np.arange(102.0, 200.0, 2.0).tolist()
     assert not late.any() and not jump[100:].any()
@@ -105,7 +105,7 @@ def test_a_sparse_clock_set_back_drops_what_it_repeats():
 def test_a_passing_leap_ahead_is_dropped():
     time = np.arange(0.0, 200.0)
     time[60:90] += 1000.0
-    late, jump, steps = order_faults(time)
+    late, jump, steps, *_ = order_faults(time)
     assert np.flatnonzero(jump).tolist() == list(range(60, 90))
     assert not late.any() and steps == ()
 
@@ -123,3 +123,37 @@ def test_every_truncated_time_of_two_days_is_found_within_half_a_turn(rng):
     # the last turn of a day has 384 s: times within half of them are told apart
     near = (time + rng.uniform(-180.0, 180.0, 5000)) % DAY
     np.testing.assert_allclose(complete(time % DAY % 512.0, 512.0, near), time % DAY, atol=1e-6)
+
+
+def test_a_passing_step_back_is_dropped():
+    time = np.arange(1000.0, 1200.0)
+    time[60:110] -= 600.0
+    late, jump, steps, *_ = order_faults(time)
+    assert np.flatnonzero(jump).tolist() == list(range(60, 110))
+    assert not late.any() and steps == ()
+
+
+def test_steps_and_leaps_are_told_with_their_size():
+    faults = order_faults(np.concatenate([np.arange(0.0, 100.0), np.arange(3700.0, 3800.0), np.arange(-500.0, -400.0)]))
+    assert (faults.leaps, faults.pauses) == ((100,), (3601.0,))
+    assert (faults.steps, faults.sizes) == ((200,), (4299.0,))
+    assert order_faults(np.arange(0.0, 1e6, 900.0)).leaps == ()  # its usual interval is no gap
+
+
+def test_times_past_the_end_of_the_day_are_none():
+    tod = np.array([0.0, 86399.99, 86400.5, 86401.0, 131071.99, -1.0, np.nan])
+    assert impossible(tod).tolist() == [False, False, False, True, True, True, False]
+
+
+def test_a_clock_that_stands_is_found_by_targets_told_again():
+    time = np.concatenate([np.arange(0.0, 50.0), np.full(60, 50.0), np.full(40, 60.0)])
+    targets = np.concatenate([np.arange(50) % 10, np.arange(60) % 10, np.arange(40)])
+    assert np.flatnonzero(standing(time, targets)).tolist() == list(range(60, 110))
+    assert not standing(time, np.full(len(time), -1)).any()
+
+
+def test_a_capture_s_clock_far_from_the_reports_is_told():
+    captured = 1e9 + np.arange(10.0)
+    assert told_clock(captured, captured - 3.0) == ""
+    assert told_clock(np.full(10, np.nan), captured) == ""
+    assert "7200 s ahead of the clock that captured them" in told_clock(captured, captured + 7200.0)

@@ -121,3 +121,11 @@ def test_every_report_is_counted_once(tmp_path):
     assert len(got.plots) == line.n_reports == 320
     assert sorted(got.plots.record.tolist()) == list(range(320))
     assert sum(line.rejected.values()) == np.count_nonzero(got.plots.reason)
+
+
+def test_an_impossible_time_of_day_is_counted_by_its_reason(tmp_path):
+    none = plot(tod=30.0).replace((30 * 128).to_bytes(3, "big"), b"\xff\xff\xff")
+    got = load(tmp_path, [*scan(*(10.0 + np.arange(30))), none])
+    assert [REASONS[c] for c in got.plots.reason[got.plots.reason > 0]] == ["impossible time of day"]
+    assert got.contents[0].rejected == {"impossible time of day": 1}
+    assert got.contents[0].time_to == MIDNIGHT + 39.0

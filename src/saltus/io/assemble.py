@@ -12,10 +12,10 @@ import pyarrow as pa
 from saltus.asterix.codec import Records, announced
 from saltus.asterix.layout import Layout
 from saltus.io.categories import CATEGORIES
-from saltus.io.clock import DAY, complete, day_offsets
+from saltus.io.clock import DAY, complete, day_offsets, impossible, told_clock
 from saltus.io.columns import SOURCE, Columns, Decoded
 from saltus.io.part import Part, revisit, rotating
-from saltus.records import Contents, Kind, Plots, Source, System, Traits
+from saltus.records import REASONS, Contents, Kind, Plots, Source, System, Traits
 
 __all__ = ["Found", "assemble"]
 
@@ -56,6 +56,9 @@ def assemble(
     """Turn records into target reports and lines of contents."""
     read = {number: _read(number, records) for number, records in found.items() if len(records)}
     times = _times(read, date, name, problems)
+    if isinstance(date, str) and read:
+        told = told_clock(*(np.concatenate(c) for c in ([r.found.clock for r in read.values()], list(times.values()))))
+        problems += [f"{name}: {told}"] if told else []
     if date is None:
         problems.append(f"{name}: no date given: times count from 1970-01-01; give --date YYYY-MM-DD.")
     plots, tracks, contents = [], [], []
@@ -92,7 +95,18 @@ def _read(number: int, found: Found) -> _Read:
     word = octets[first].astype(np.int64) << 8 | octets[np.minimum(first + 1, stop - 1)]
     values, which = np.unique(word, return_inverse=True)
     systems = [System(number, int(v) >> 8, int(v) & 255) for v in values]
-    return _Read(found, CATEGORIES[number].decode(found.columns), systems, which.astype(np.int64))
+    return _Read(found, _possible(CATEGORIES[number].decode(found.columns)), systems, which.astype(np.int64))
+
+
+def _possible(decoded: Decoded) -> Decoded:
+    """Take away the times of day that are none, and give their reports the reason."""
+    wrong = impossible(decoded.time_of_day)
+    if not wrong.any():
+        return decoded
+    reason = np.asarray(decoded.columns.get("reason", np.zeros(len(wrong))), np.int8)
+    marked = np.where(wrong & (reason == 0), REASONS.index("impossible time of day"), reason)
+    columns = {**decoded.columns, "reason": marked}
+    return decoded._replace(time_of_day=np.where(wrong, np.nan, decoded.time_of_day), columns=columns)
 
 
 def _times(

@@ -9,14 +9,27 @@ import numpy.typing as npt
 
 from saltus.shapes import Float, Int
 
-__all__ = ["DAY", "SORTING_WINDOW", "OrderFaults", "complete", "day_offsets", "order_faults"]
+__all__ = [
+    "DAY",
+    "SORTING_WINDOW",
+    "OrderFaults",
+    "complete",
+    "day_offsets",
+    "impossible",
+    "order_faults",
+    "standing",
+    "told_clock",
+]
 
 DAY = 86400.0  # s
+_LEAP_SECOND = 1.0  # s past the end of a day
 SORTING_WINDOW = 2.0  # s: radars send sector by sector, multi-channel receivers a little late
 _WILD = 60.0  # s: a report this far behind is no late report, its clock jumped
 _LONE = 600.0  # s: the last reports of a file have no followers to confirm a leap of this size
 _SILENT = 10.0, 20.0  # s and median intervals: where later reports are silent for longer, they repeat no time
 _AHEAD, _FOR_GOOD, _EXCURSION = 10, 50, 100  # reports looked at to tell wild, lasting and passing steps apart
+_RUN, _AGAIN = 20, 0.5  # reports at one time, and the share of targets told again, by which a clock stands
+_APART = 600.0  # s between the clock of a capture and the times of its reports that is no delay
 
 
 class OrderFaults(NamedTuple):
@@ -25,6 +38,55 @@ class OrderFaults(NamedTuple):
     late: npt.NDArray[np.bool_]  # older than the newest by more than the sorting window
     jump: npt.NDArray[np.bool_]  # a wild time, or one the clock repeated after it was set back
     steps: tuple[int, ...]  # indices at which the clock stepped back for good
+    sizes: tuple[float, ...] = ()  # by how much, s, for each step
+    leaps: tuple[int, ...] = ()  # indices at which times go on long after all before: a gap, or a clock that was set
+    pauses: tuple[float, ...] = ()  # by how much, s, for each leap
+
+
+def impossible(time_of_day: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Say which times of day are none: before midnight, or past the end of the day (a leap second counts), (N,)."""
+    tod = np.asarray(time_of_day, np.float64)
+    return np.asarray((tod < 0.0) | (tod >= DAY + _LEAP_SECOND))
+
+
+def told_clock(captured: npt.ArrayLike, time: npt.ArrayLike) -> str:
+    """Say how far the times of reports are from the clock of the capture they lie in, "" where no more than delayed.
+
+    Args:
+        captured: when each report was captured, s, UTC, NaN unknown, (N,).
+        time: of the reports, s, UTC, (N,).
+    """
+    apart = np.asarray(time, np.float64) - np.asarray(captured, np.float64)
+    apart = apart[np.isfinite(apart)]
+    if not len(apart) or abs(float(np.median(apart))) < _APART:
+        return ""
+    middle = float(np.median(apart))
+    return (
+        f"the times of its reports are {abs(middle):.0f} s {'ahead of' if middle > 0 else 'behind'} the clock that "
+        "captured them: one of the two is wrong, or tells local time. The reports' own times are used."
+    )
+
+
+def standing(time: Float[np.ndarray, " n"], identity: Int[np.ndarray, " n"]) -> npt.NDArray[np.bool_]:
+    """Find reports of one source, in the order received, at a time at which its clock stands still.
+
+    Of twenty or more reports at one time, more than half of those that tell a target tell one that had been told at
+    that very time: no sensor sees everything twice at once. From the first of these on, the run's times are none.
+
+    Args:
+        time: (N,) s.
+        identity: what tells targets apart, -1 = not given, (N,).
+    """
+    stands = np.zeros(len(time), np.bool_)
+    edges = np.flatnonzero(np.diff(time, prepend=np.nan, append=np.nan) != 0)
+    for start, stop in pairwise(edges.tolist()):
+        known = start + np.flatnonzero(identity[start:stop] >= 0)
+        if stop - start < _RUN or not len(known):
+            continue
+        first = np.unique(identity[known], return_index=True)[1]
+        if len(known) - len(first) > _AGAIN * len(known):
+            stands[np.delete(known, first)[0] : stop] = True
+    return stands
 
 
 def complete(
@@ -92,8 +154,9 @@ def order_faults(time: Float[np.ndarray, " n"]) -> OrderFaults:
     window is late, or a jump when it is a minute or more behind. When nine in ten of the next fifty are behind
     as well, the clock was set back for good: the reports from there on are right and keep their times, and of the
     earlier ones those among the times that the clock then repeats are jumps (if the clock had only leapt ahead for
-    up to a hundred reports, these are). Leaps ahead for good are gaps, and what an earlier stretch tells of a gap
-    is no repetition: recordings joined out of order keep their reports.
+    up to a hundred reports, these are; likewise if it goes on, within a hundred reports, where it was before it was set
+    back). Leaps ahead for good are gaps, and what an earlier stretch tells of a gap is no repetition: recordings
+    joined out of order keep their reports.
 
     Args:
         time: (N,) s, finite.
@@ -101,11 +164,15 @@ def order_faults(time: Float[np.ndarray, " n"]) -> OrderFaults:
     n = len(time)
     late, jump = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
     steps: list[int] = []
+    sizes: list[float] = []
     behind = np.maximum.accumulate(time) - time if n else time
     if not np.any(behind > SORTING_WINDOW) and not np.any(np.diff(time[-4:]) > _LONE):
-        return OrderFaults(late, jump, ())
+        return OrderFaults(late, jump, (), (), *_leaps(time, late))
     mark, leap, before = -np.inf, 0, np.inf  # watermark; last leap ahead: where, and the watermark before it
+    resumed = 0  # where the clock goes on after a passing step back
     for k in range(n):
+        if k < resumed:
+            continue
         t = float(time[k])
         if t >= mark - SORTING_WINDOW:
             if t > mark + SORTING_WINDOW:
@@ -122,8 +189,12 @@ def order_faults(time: Float[np.ndarray, " n"]) -> OrderFaults:
             if t >= before - SORTING_WINDOW and k - leap <= _EXCURSION:
                 jump[leap:k] = True
                 mark = max(before, t)
+            elif resumed := _goes_on(time, k, mark):
+                jump[k:resumed] = True
+                continue
             else:
                 steps.append(k)
+                sizes.append(mark - t)
                 mark = t
             before = np.inf
         elif mark - t > _WILD:
@@ -131,7 +202,28 @@ def order_faults(time: Float[np.ndarray, " n"]) -> OrderFaults:
         else:
             late[k] = True
     _mark_repeated(time, late, jump, steps)
-    return OrderFaults(late & ~jump, jump, tuple(steps))
+    return OrderFaults(late & ~jump, jump, tuple(steps), tuple(sizes), *_leaps(time, late | jump))
+
+
+def _goes_on(time: npt.NDArray[np.float64], k: int, mark: float) -> int:
+    """Where, soon after a step back at k, the times go on from the watermark; 0 where they do not."""
+    ahead = np.diff(time[k : k + _EXCURSION + 1], prepend=time[k])
+    again = (time[k : k + _EXCURSION + 1] >= mark - SORTING_WINDOW) & (ahead > 0.5 * (mark - time[k]))
+    for j in (k + np.flatnonzero(again)).tolist():
+        ahead = time[j : j + _AHEAD]
+        if len(ahead) >= _AHEAD and np.mean(np.abs(ahead - mark) < _WILD) > 0.5:
+            return int(j)
+    return 0
+
+
+def _leaps(time: npt.NDArray[np.float64], wrong: npt.NDArray[np.bool_]) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Indices of right reports before which no time of their source is for long, and for how long."""
+    right = np.flatnonzero(~wrong)
+    newest = np.maximum.accumulate(time[right])
+    pause = np.diff(newest)
+    usual = float(np.median(pause)) if len(pause) else 0.0
+    long = pause > max(_LONE, _SILENT[1] * usual)
+    return tuple(right[1:][long].tolist()), tuple(pause[long].tolist())
 
 
 def _stands_alone(time: npt.NDArray[np.float64], k: int, mark: float) -> bool:

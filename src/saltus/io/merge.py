@@ -1,16 +1,16 @@
 """Files to one recording: what cannot be a plot is marked, counted by reason, and the rest put in time order."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.io.clock import DAY, order_faults
+from saltus.io.clock import DAY, order_faults, standing
 from saltus.io.part import Part
-from saltus.records import REASONS, Contents, Kind, Plots, Recording
+from saltus.records import REASONS, Contents, Kind, Plots, Recording, Source
 
 __all__ = ["LIMITS", "merge"]
 
@@ -31,6 +31,8 @@ LIMITS = {
     "observer_height": (-1500.0, 60000.0),
     "time": (-DAY, 4.2e9),
 }
+_CODE = 1 << 24  # above all addresses
+_JUDGED = 20  # reports by which a clock is judged
 _OBSERVER = ("observer_latitude", "observer_longitude", "observer_height")
 _POSITION = {
     Kind.POLAR: ("range", "azimuth"),
@@ -46,7 +48,7 @@ def merge(parts: Sequence[Part]) -> Recording:
     Reports that cannot be plots keep their row and get a reason, in this order: what the reader found (coasted,
     simulated, ...), no position, no time, not a number, out of range, duplicate (same source, time, address and
     position to the bit as an earlier usable report), and per source and file clock jump and out of order
-    (`saltus.io.clock.order_faults`).
+    (`saltus.io.clock`).
     """
     parts, problems = _align_days(parts)
     plots = Plots.concat([part.plots for part in parts])
@@ -112,27 +114,64 @@ def _repeats(plots: Plots, reason: npt.NDArray[np.int8]) -> npt.NDArray[np.bool_
 
 
 def _mark_order(plots: Plots, reason: npt.NDArray[np.int8], again: npt.NDArray[np.bool_], file: int) -> list[str]:
-    """Mark the reports of one file that come too late or whose clock jumped; tell lasting steps.
+    """Mark the reports of one file that come too late or whose clock jumped or stands; tell what lasts.
 
     Repeated reports, used or not (coasted, ...), say nothing about the clock: a recording doubled is as one.
     """
     told = []
-    skipped = [REASONS.index(text) for text in ("no time", "system track")]
+    skipped = [REASONS.index(text) for text in ("no time", "impossible time of day", "system track")]
+    identity = np.where(plots.icao24 >= 0, plots.icao24.astype(np.int64), _CODE + plots.mode3a.astype(np.int64))
+    identity[(plots.icao24 < 0) & (plots.mode3a < 0)] = -1
     for k, source in enumerate(plots.sources):
         mine = (plots.file == file) & (plots.source == k) & ~np.isin(reason, skipped) & ~again
         index = np.flatnonzero(mine & np.isfinite(plots.time))
-        faults = order_faults(plots.time[index])
+        time = plots.time[index]
+        stands = standing(time, identity[index])
+        faults = order_faults(time[~stands])
         jump, late = np.zeros(len(plots), np.bool_), np.zeros(len(plots), np.bool_)
-        jump[index], late[index] = faults.jump, faults.late
+        jump[index[stands]] = True
+        moving = index[~stands]
+        jump[moving], late[moving] = faults.jump, faults.late
         _mark(reason, jump, "clock jump")
         _mark(reason, late, "out of order")
-        for step in faults.steps:
-            back = plots.time[index[step - 1]] - plots.time[index[step]]
-            told.append(
-                f"{plots.files[file]}: record {plots.record[index[step]]} of {source.system}: the clock steps back by "
-                f"{back:.3f} s for good. Later reports keep their times; of the earlier ones those at times that the "
-                "clock repeats are not used (clock jump). If recordings were joined out of order, give them apart."
-            )
+
+        def place(at: np.intp, of: Source = source) -> str:
+            return f"{plots.files[file]}: record {plots.record[at]} of {of.system}"
+
+        told += [
+            f"{place(moving[step])}: the clock steps back by {size:.3f} s for good. Later reports keep their times; of "
+            "the earlier ones those at times that the clock repeats are not used (clock jump). If recordings were "
+            "joined out of order, give them apart."
+            for step, size in zip(faults.steps, faults.sizes, strict=True)
+        ]
+        told += [
+            f"{place(moving[leap])}: its times go on {pause:.0f} s after all before: reports are missing, or the clock "
+            "was set ahead."
+            for leap, pause in zip(faults.leaps, faults.pauses, strict=True)
+        ]
+        told += _told_wrong(place, index, stands, jump | late)
+    return told
+
+
+def _told_wrong(
+    place: Callable[[np.intp], str],
+    index: npt.NDArray[np.intp],
+    stands: npt.NDArray[np.bool_],
+    wrong: npt.NDArray[np.bool_],
+) -> list[str]:
+    """Lines on a clock that stands, and on one that is wrong more often than right."""
+    told = []
+    if stands.any():
+        told.append(
+            f"{place(index[stands.argmax()])}: the clock stands still: targets are told again at the time they had. "
+            f"{np.count_nonzero(stands)} reports of one time are not used (clock jump)."
+        )
+    count = int(np.count_nonzero(wrong[index]))
+    if 2 * count > len(index) >= _JUDGED and not stands.any():
+        told.append(
+            f"{place(index[0])}: {count} of {len(index)} times are in no order (clock jump, out of order): the clock "
+            "of this source, or the order of this file, cannot be relied upon."
+        )
     return told
 
 
@@ -177,7 +216,15 @@ def _count(line: Contents, plots: Plots, file: int) -> Contents:
     counts = Counter(plots.reason[mine & (plots.reason > 0)].tolist())
     line = replace(line, rejected={REASONS[code]: n for code, n in sorted(counts.items())})
     wild = [
-        REASONS.index(text) for text in ("clock jump", "out of order", "no time", "out of range", "coasted by station")
+        REASONS.index(text)
+        for text in (
+            "clock jump",
+            "out of order",
+            "no time",
+            "impossible time of day",
+            "out of range",
+            "coasted by station",
+        )
     ]
     times = plots.time[mine & ~np.isin(plots.reason, wild) & np.isfinite(plots.time)]
     if line.n_records == line.n_reports and len(times):
