@@ -59,6 +59,7 @@ class Framer:
         self._longest = np.zeros(256, np.int32)  # bytes of the blocks of each category so far
         self._origin: float | None = None  # s, UTC, from which the container's clock counts
         self._gap = self._previous = -1  # bytes of the file: where frames ended, where the last packet begins
+        self._resumed = self._begun = -1  # where frames were last found again, where another framing last began
         self._stamp = b""  # its first word, the time of a classic capture
         self._lines: dict[int, int] = {}  # channel in the frames -> its number
 
@@ -247,15 +248,18 @@ class Framer:
             own, name = next_frame(view, place, c), c.name
         else:
             place = max(self._previous + 16 - self._base, 0) if self._gap < 0 <= self._previous else place
+            place = max(place, self._resumed + 1 - self._base)  # twice at one place had no end
             own, name = next_packet(view.data, place, view.last, self._packets, self._stamp), "pcap"
         last = own if own >= 0 else view.last
         other = None if self._asked else next_framing(view, place, last, name, short=short)
-        if other is not None:
+        if other is not None and self._base + other[0] > self._begun:  # twice at one place had no end
+            self._begun = self._base + other[0]
             yield from self._ended(view, other[0])
             self._begin(other[1], other[0], other[2])
         elif own >= 0:
             yield from self._ended(view, own)
             self._place = self._keep = own
+            self._resumed = self._base + own
         elif view.final:
             yield from self._ended(view, len(view.data), short=short)
             self._place = len(view.data)

@@ -99,50 +99,59 @@ def _read_parquet(path: Path, wanted: Collection[str] | None, memory: float) -> 
     try:
         with parquet.ParquetFile(path) as whole:
             schema, rows = whole.schema_arrow, whole.metadata.num_rows
-            names = [shown(name) for name in schema.names]
-            refuse_size(path, rows * PER_ROW, memory, f"{rows} rows")
-            unused = _counts(whole, names)
-        at = _wanted(path, names, wanted)
-        raw = [schema.names[k] for k in at]
-        text = [name for name in raw if is_text(schema.field(name).type)]
+        names = [shown(name) for name in schema.names]
+        refuse_size(path, rows * PER_ROW, memory, f"{rows} rows")
+        at = [schema.names[k] for k in _wanted(path, names, wanted)]
+        text = [field.name for field in schema if is_text(field.type)]
         with parquet.ParquetFile(path, read_dictionary=text) as file:
-            table = _unpacked(path, file, raw, memory)
+            table, counts = _unpacked(path, file, at, memory)
     except UnicodeDecodeError as error:
         named = brief(bytes(error.object))
         raise DataError(f"{path}: the name of a column is no UTF-8 text: {named}; rename it.") from error
-    except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
+    except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError, MemoryError) as error:
         said = cut((str(error) or type(error).__name__).splitlines()[0], 200)
         raise DataError(f"{path}: no readable Parquet table: {said}") from error
-    columns = {names[k]: table[schema.names[k]] for k in at}
-    left = {name: count for name, count in unused.items() if name not in columns}
-    return Sheet(path, table.num_rows, columns, left, np.zeros(table.num_rows, np.bool_))
+    columns = {shown(name): table[name] for name in at}
+    unused = {shown(name): counts.get(name, table.num_rows) for name in schema.names if name not in at}
+    return Sheet(path, table.num_rows, columns, unused, np.zeros(table.num_rows, np.bool_))
 
 
-def _counts(file: "ParquetFile", names: Sequence[str]) -> dict[str, int]:
-    """Cells of each column that hold something, as the file says itself."""
-    rows = file.metadata.num_rows
-    counts = dict.fromkeys(names, rows)
-    for k in range(file.metadata.num_columns):
-        name = shown(file.schema.column(k).path)
-        parts = [file.metadata.row_group(g).column(k).statistics for g in range(file.metadata.num_row_groups)]
-        if name in counts and all(p is not None and p.has_null_count for p in parts):
-            counts[name] = min(max(rows - sum(p.null_count for p in parts), 0), rows)
-    return counts
+def _unpacked(path: Path, file: "ParquetFile", names: list[str], memory: float) -> tuple[pa.Table, dict[str, int]]:
+    """Read columns batch by batch, and stop when they outgrow the memory.
 
-
-def _unpacked(path: Path, file: "ParquetFile", names: Sequence[str], memory: float) -> pa.Table:
-    """Read columns batch by batch, and stop when they outgrow the memory."""
+    Returns:
+        The columns of these names, and of every other that is no nest the number of cells that hold something: what a
+        file says of itself is not believed (and Arrow ends the program where that is damaged).
+    """
+    flat = [f.name for f in file.schema_arrow if not pa.types.is_nested(f.type)]
+    every = list(dict.fromkeys([*names, *(name for name in flat if file.schema_arrow.names.count(name) == 1)]))
+    others = [name for name in every if name not in names]
     batches = []
+    counts = dict.fromkeys(others, 0)
     rows = 0
-    for batch in file.iter_batches(batch_size=_ROWS, columns=names):
+    for batch in file.iter_batches(batch_size=_ROWS, columns=every):
         rows += batch.num_rows
-        batches.append(batch.select(names))
         refuse_size(path, rows * PER_ROW, memory, f"more than {rows} rows")
-        if batch.nbytes > _BLOCK:
+        for name in others:
+            counts[name] += len(batch[name]) - batch[name].null_count
+        batches.append(_sound(path, batch.select(names)))
+        if batches[-1].nbytes > _BLOCK:
             size = pa.Table.from_batches(batches).get_total_buffer_size()
             refuse_size(path, rows * PER_ROW + size, memory, f"{rows} rows of {size / rows:.0f} bytes")
     schema = pa.schema([file.schema_arrow.field(name) for name in names])
-    return pa.Table.from_batches(batches, None if batches else schema)
+    return pa.Table.from_batches(batches, None if batches else schema), counts
+
+
+def _sound(path: Path, batch: pa.RecordBatch) -> pa.RecordBatch:
+    """Refuse texts that are said to be where none is."""
+    for name, column in zip(batch.schema.names, batch.columns, strict=True):
+        if pa.types.is_dictionary(column.type):
+            which = pc.min_max(column.indices).as_py()
+            if len(column) > column.null_count and not 0 <= which["min"] <= which["max"] < len(column.dictionary):
+                raise DataError(
+                    f"{path}: column {brief(shown(name))} is damaged: it names texts that it does not hold."
+                )
+    return batch
 
 
 def _read_csv(path: Path, wanted: Collection[str] | None, memory: float) -> Sheet:

@@ -1,0 +1,351 @@
+"""Inputs bent out of shape, and what every reader must do with them.
+
+A target reads one kind of file through the public entry points, so whatever decodes behind them is covered. An input
+passes when it is read, or refused by a DataError or ModelError, within five seconds of CPU; and when it is read, every
+record of it is a report, a rejected report with its reason, or told among the problems.
+"""
+
+import csv
+import random
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from saltus.config import load_config
+from saltus.diagnose.residuals import from_table
+from saltus.errors import DataError, ModelError
+from saltus.evaluate.tables import read_reference, read_tracks
+from saltus.gap import load_scenario
+from saltus.io import FORMATS, ReadingSettings, read
+from saltus.io.merge import LIMITS
+from saltus.records import REASONS, Kind, Recording
+
+TESTS = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(TESTS / "io"), str(TESTS / "framing")]
+
+import containers_made as made  # noqa: E402
+import frames  # noqa: E402
+
+CORPUS = Path(__file__).parent / "corpus"
+LONGEST = 5.0  # s of CPU
+SETTINGS = ReadingSettings(memory=2e8)
+
+
+POSITIONS = {  # what positions of these kinds alone must not exceed
+    "range": (Kind.POLAR,),
+    "azimuth": (Kind.POLAR, Kind.BEARING),
+    "x": (Kind.PLANE,),
+    "y": (Kind.PLANE,),
+    "latitude": (Kind.GEODETIC,),
+    "longitude": (Kind.GEODETIC,),
+}
+
+
+class Failed(AssertionError):
+    """What a reader must not do, and with which input."""
+
+
+class Target(NamedTuple):
+    """A kind of file: its suffix, good files, words that mean something in it, and what reads it."""
+
+    name: str
+    suffix: str
+    seeds: tuple[bytes, ...]
+    words: tuple[bytes, ...]
+    read: Callable[[Path], object]
+    blocks: int = 0  # ASTERIX blocks of every seed, one record each
+
+
+def check(target: Target, content: bytes, folder: Path) -> str:
+    """Read one input and return "read" or "refused".
+
+    Raises:
+        Failed: a foreign exception, more than `LONGEST`, or a record that is unaccounted for.
+    """
+    path = folder / f"input{target.suffix}"
+    path.write_bytes(content)
+    began = time.process_time()
+    try:
+        found = target.read(path)
+    except (DataError, ModelError) as error:
+        if str(path) not in str(error) and path.name not in str(error):
+            raise Failed(f"{target.name}: the message names no file: {error}") from error
+        found = None
+    except Exception as error:
+        raise Failed(f"{target.name}: {type(error).__name__}: {error}") from error
+    lasted = time.process_time() - began
+    if lasted > LONGEST:
+        raise Failed(f"{target.name}: {lasted:.1f} s of CPU")
+    if isinstance(found, Recording):
+        account(found, content, target)
+    return "refused" if found is None else "read"
+
+
+def account(found: Recording, content: bytes, target: Target) -> None:
+    """See that every record is a report, rejected, or told."""
+    plots = found.plots
+    if int(sum(c.n_reports for c in found.contents)) != len(plots):
+        raise Failed(f"{target.name}: {sum(c.n_reports for c in found.contents)} reports counted, {len(plots)} read")
+    counted = Counter(plots.reason[plots.reason > 0].tolist())
+    told: Counter[int] = Counter()
+    for line in found.contents:
+        told.update({REASONS.index(reason): n for reason, n in line.rejected.items()})
+    if counted != told:
+        raise Failed(f"{target.name}: rejected {dict(counted)}, told {dict(told)}")
+    usable = plots.take(plots.reason == 0)
+    if not np.isfinite(usable.time).all() or np.any(usable.kind == Kind.NONE) or np.any(np.diff(usable.time) < 0):
+        raise Failed(f"{target.name}: a usable report has no time or no position, or is out of order")
+    for name, (low, high) in LIMITS.items():
+        values, kinds = getattr(usable, name), POSITIONS.get(name, ())
+        if np.any(((values < low) | (values > high)) & (np.isin(usable.kind, kinds) if kinds else True)):
+            raise Failed(f"{target.name}: {name} of a usable report is out of range")
+    shown = [*found.problems, *plots.files, *(str(s.system) for s in plots.sources), *set(plots.callsign.tolist())]
+    if not all(text.isprintable() for text in shown):
+        raise Failed(f"{target.name}: what is said would steer a terminal")
+    records = int(sum(c.n_records for c in found.contents))
+    expected = rows_of(content) if target.suffix == ".csv" else target.blocks
+    silent = not found.problems and not any(c.notes for c in found.contents)
+    if target.suffix == ".csv" and expected is not None and records != expected:
+        raise Failed(f"{target.name}: {records} rows read of {expected}")
+    if target.blocks and silent and records < untouched(content, target):
+        raise Failed(f"{target.name}: {records} records read in silence, {untouched(content, target)} blocks are whole")
+
+
+def rows_of(content: bytes) -> int | None:
+    """Rows below the header of a CSV table, None where quotes or lone carriage returns make it a matter of taste."""
+    if b'"' in content or content.count(b"\r") != content.count(b"\r\n"):
+        return None
+    lines = [cells for cells in csv.reader(content.decode("latin-1").split("\n")) if any(cells) or len(cells) > 1]
+    return len(lines) - 1
+
+
+def untouched(content: bytes, target: Target) -> int:
+    """Blocks of a plain file's seed that lie whole in an input."""
+    best = 0
+    for seed in target.seeds:
+        position = count = 0
+        while position + 3 <= len(seed):
+            size = int.from_bytes(seed[position + 1 : position + 3], "big")
+            count += seed[position : position + size] in content
+            position += max(size, 1)
+        best = max(best, count)
+    return best
+
+
+def mutated(draw: random.Random, target: Target) -> tuple[bytes, int]:
+    """An input bent out of shape, and how many of its bytes were changed, put in or taken out."""
+    data = bytearray(draw.choice(target.seeds))
+    changed = 0
+    for _ in range(draw.choice((1, 1, 2, 3, 8, 20))):
+        at = draw.randrange(len(data) + 1)
+        size = min(draw.choice((1, 1, 2, 4, 16, 100, 1000)), len(data) - at)
+        match draw.randrange(9):
+            case 0:
+                size, bit = min(size, 1), 1 << draw.randrange(8)
+                data[at : at + size] = bytes(b ^ bit for b in data[at : at + size])
+            case 1:
+                data[at : at + size] = draw.choice((b"\0", b"\xff", b"\x80", b"\x7f", b"\x01", b"0", b" ")) * size
+            case 2:
+                data[at : at + size] = draw.randbytes(size)
+            case 3:
+                data[at:at] = draw.randbytes(max(size, 1))
+                size = max(size, 1)
+            case 4:
+                del data[at : at + size]
+            case 5:
+                data[at:at] = data[at : at + size]
+            case 6:
+                word = draw.choice(target.words)
+                data[at : at + draw.choice((0, len(word)))] = word
+                size = len(word)
+            case 7:
+                other = draw.choice(target.seeds)
+                begin = draw.randrange(len(other) + 1)
+                data[at:at] = other[begin : begin + size]
+            case _:
+                size = min(len(data) - at, len(data) // 2) if not draw.randrange(4) else 0
+                del data[len(data) - size :]
+        changed += size
+        if len(data) > 40_000:
+            del data[40_000:]
+    return bytes(data), changed
+
+
+def corpus() -> Iterator[tuple[str, bytes]]:
+    """Every input that ever failed: the target's name, which begins the file's, and its bytes."""
+    for path in sorted(CORPUS.iterdir()):
+        yield path.name.split("--")[0], path.read_bytes()
+
+
+def _radar(k: int) -> bytes:
+    return frames.plot(tod=100 + 0.5 * k, rho=2560 + 8 * k, theta=(1500 * k) % 65536, sic=0x81 + (k % 5 == 0))
+
+
+def _blocks(category: int, bodies: list[str]) -> bytes:
+    parts = [bytes.fromhex(body) for body in bodies]
+    return b"".join(bytes([category]) + (3 + len(part)).to_bytes(2, "big") + part for part in parts)
+
+
+def _tod(k: int) -> str:
+    return f"{round((100 + 0.5 * k) * 128):06x}"
+
+
+def _asterix() -> dict[str, bytes]:
+    """Plain recordings of every category that is read, 40 blocks of one record each."""
+    n = range(40)
+    return {
+        "cat048": b"".join(_radar(k) for k in n),
+        "cat034": b"".join((_radar(k) if k % 4 else frames.NORTH) for k in n),
+        "cat010": _blocks(10, [f"f304 0007 01 20 {_tod(k)} {1500 + k:04x}fffe {0x3C6444 + k % 3:06x}" for k in n]),
+        "cat021": _blocks(
+            21, [f"c71902 14db 0140 {0x1C71C7 + k:06x}000000 0e38e3{k:02x}00000000 abcdef {_tod(k)} 0578" for k in n]
+        ),
+        "cat062": _blocks(62, [f"9948 14db {_tod(k)} {0x0E38E38 + k:08x} 00100000 029c {k % 4:04x}" for k in n]),
+    }
+
+
+def _table(n: int = 40) -> dict[str, list[object]]:
+    draw = np.random.default_rng(5)
+    return {
+        "time": [1.7e9 + 4.0 * k for k in range(n)],
+        "latitude": [round(41 + 0.002 * k + 1e-4 * draw.standard_normal(), 6) for k in range(n)],
+        "longitude": [round(2 + 0.003 * k, 6) if k % 9 else None for k in range(n)],
+        "range_m": [round(9e3 + 90 * k, 1) if k % 4 == 3 else None for k in range(n)],
+        "azimuth_deg": [round((7.0 * k) % 360, 3) for k in range(n)],
+        "altitude_m": [3000 + k for k in range(n)],
+        "icao24": [f"{0x400000 + k % 3:06x}" for k in range(n)],
+        "mode3a": ["1200" if k % 2 else None for k in range(n)],
+        "callsign": [f"ÉTÉ{k % 3}" for k in range(n)],
+        "on_ground": ["false" if k % 2 else "" for k in range(n)],
+        "source": [("radar", "mlat")[k % 2] for k in range(n)],
+        "kind": [("", "geodetic")[k % 2] for k in range(n)],
+        "note": [f"row {k}" for k in range(n)],
+    }
+
+
+def _csv(columns: dict[str, list[object]], end: str = "\n") -> bytes:
+    rows = zip(*columns.values(), strict=True)
+    lines = [",".join(columns), *(",".join("" if v is None else str(v) for v in row) for row in rows)]
+    return (end.join(lines) + end).encode()
+
+
+def _parquet(columns: dict[str, list[object]], **options: object) -> bytes:
+    sink = pa.BufferOutputStream()
+    pq.write_table(pa.table(columns), sink, **options)
+    return bytes(sink.getvalue())
+
+
+_TRUTH = {
+    "time": [1.7e9 + k for k in range(20)],
+    "target_id": [f"a{k % 2}" for k in range(20)],
+    "latitude": [41 + 0.01 * k for k in range(20)],
+    "longitude": [2.0] * 20,
+    "altitude": [3000.0] * 20,
+}
+_TRACKS = {name: [float(k % 3) for k in range(20)] for name in ("track_id", "latitude", "longitude")} | {
+    "time": [1.7e9 + k for k in range(20)],
+    **dict.fromkeys(("cov_ee", "cov_nn"), [9.0] * 20),
+    "cov_en": [0.0] * 20,
+    "status": [("confirmed", "coasted")[k % 2] for k in range(20)],
+}
+_CONFIG = (
+    b'date = 2023-05-02\n[[sensor]]\nsac = 20\nsic = 129\nlatitude = 41.3\nlongitude = 2.1\nheight = 27\nname = "BCN"\n'
+    b'sigma_range = 3.5\nperiod = 4.0\n[[sensor]]\nname = "pier"\nsystem = "platform"\n[editions]\n21 = "0.23"\n'
+    b"[reading]\nmemory = 4e9\n[tracker]\nmax_speed = 300\nconfirm_hits = 2\nheight_prior = [5e3, 3e3]\n"
+    b'[filter]\nform = "joint"\naccel_h = [0.2, 3]\n[systems]\np_false = 1e-3\n[registration]\n'
+)
+_CELLS = (
+    *(
+        b"nan",
+        b"inf",
+        b"-1",
+        b"1e999",
+        b"9" * 400,
+        b"NULL",
+        b'"',
+        b'"",',
+        b",",
+        b",,",
+        b"\n",
+        b"\r",
+        b"\r\n",
+        b"\xc3\xa9",
+    ),
+    *(b"\x1b[2J", b"\xff\xfe", b"\0", b"\xef\xbb\xbf", b"2024-05-01T12:00:00Z", b"time", b"F" * 17, b"2024-13-45"),
+)
+_VALUES = (
+    *(
+        b"nan",
+        b"inf",
+        b"-inf",
+        b"1e400",
+        b"-1",
+        b"0",
+        b"9" * 400,
+        b"9" * 5000,
+        b"[]",
+        b"{}",
+        b'""',
+        b"true",
+        b"[[1.0]]",
+    ),
+    *(
+        b"3",
+        b"1979-05-27",
+        b"1979-05-27T07:32:00Z",
+        b"[" * 500,
+        b"{a=" * 200,
+        b"'''",
+        b'"""',
+        b"#",
+        b"=",
+        b"\n",
+        b"[a]\n",
+    ),
+    *(b"[[a]]\n", b"\xc3\xa9", b"\x1b", b'"\\u0000"', b'"\\ud800"', b"0x10", b"1_0", b"+1", b"{by = {radar = 1}}"),
+    *(b"[1, [2]]", b"['a', 1]", b"\xff", b"\0"),
+)
+_BYTES = (b"\0\0\0", b"\xff\xff\xff", b"\x30\x00\x1f", b"\x22\x00\x0c", b"\0\x03", b"\xff\xff", b"\x15\0\x04")
+
+
+def _record(path: Path) -> Recording:
+    return read([path], settings=SETTINGS)
+
+
+def _residuals(path: Path) -> object:
+    return from_table(path, ["latitude", "altitude_m"], "source")
+
+
+def targets() -> dict[str, Target]:
+    """One of each reader, over recordings and tables that the project makes itself."""
+    plain = _asterix()
+    bodies = [plain["cat048"][31 * k : 31 * k + 31] for k in range(40)]
+    datagrams = [made.ethernet(made.ipv4(made.udp(body))) for body in bodies]
+    captures = (made.pcap(datagrams), made.pcap(datagrams, order=">"), made.pcapng(datagrams))
+    contained = tuple(build(bodies) for name, build in made.CONTAINERS.items() if name != "plain")
+    examples = TESTS.parent / "examples"
+    models = tuple(path.read_bytes() for path in sorted(examples.glob("gap_*.toml")))
+    table = _table()
+    parquet = (_parquet(table), _parquet(table, compression="none", use_dictionary=False, row_group_size=7))
+    found = [
+        *(Target(name, ".ast", (data,), _BYTES, _record, 40) for name, data in plain.items()),
+        Target("mixed", ".ast", (b"".join(plain.values()),), _BYTES, _record),
+        Target("capture", ".pcap", captures, _BYTES, _record),
+        Target("container", ".raw", contained, _BYTES, _record),
+        Target("csv", ".csv", (_csv(table), _csv(table, "\r\n")), _CELLS, _record),
+        Target("parquet", ".parquet", parquet, _CELLS, _record),
+        Target("truth", ".csv", (_csv(_TRUTH),), _CELLS, read_reference),
+        Target("tracks", ".parquet", (_parquet(_TRACKS),), _CELLS, read_tracks),
+        Target("residuals", ".csv", (_csv(table),), _CELLS, _residuals),
+        Target("config", ".toml", (_CONFIG,), _VALUES, load_config),
+        Target("model", ".toml", models, _VALUES, load_scenario),
+    ]
+    assert {f.name for f in FORMATS} == {"Parquet table", "packet capture", "ASTERIX", "CSV table"}, "a format unfuzzed"
+    return {target.name: target for target in found}

@@ -1,0 +1,28 @@
+"""Readers under mutated inputs, seeded, and every input that ever failed. `make fuzz` goes on for hours."""
+
+import random
+
+import pytest
+from fuzzing import check, corpus, mutated, targets
+
+TARGETS = targets()
+INPUTS = 150  # of each target
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_good_inputs_are_read(name, tmp_path):
+    target = TARGETS[name]
+    for seed in target.seeds:
+        assert check(target, seed, tmp_path) == "read"
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_mutated_inputs_are_read_or_refused_and_accounted_for(name, tmp_path):
+    draw = random.Random(f"saltus {name}")
+    for _ in range(INPUTS):
+        check(TARGETS[name], mutated(draw, TARGETS[name])[0], tmp_path)
+
+
+@pytest.mark.parametrize(("name", "content"), [pytest.param(n, c, id=f"{n}-{k}") for k, (n, c) in enumerate(corpus())])
+def test_inputs_that_once_failed(name, content, tmp_path):
+    check(TARGETS[name], content, tmp_path)
