@@ -154,8 +154,8 @@ def test_a_table_too_large_is_refused_with_its_size(tmp_path):
     (tmp_path / "t.csv").write_bytes(text + b" " * 1_000_000)
     with pytest.raises(DataError, match=r"t\.csv: the file alone"):
         read([tmp_path / "t.csv"], settings=small)
-    (tmp_path / "t.ast").write_bytes(bytes.fromhex("300006") + b"\0" * 20_000)
-    with pytest.raises(DataError, match=r"t\.ast: 0\.02 MB of ASTERIX"):
+    (tmp_path / "t.ast").write_bytes(bytes.fromhex("300006") + b"\0" * 40_000)
+    with pytest.raises(DataError, match=r"t\.ast: 0\.04 MB of ASTERIX"):
         read([tmp_path / "t.ast"], settings=small)
 
 

@@ -16,7 +16,7 @@ from saltus.text import brief
 
 __all__ = ["FORMATS", "Format", "ReadingSettings", "Told", "format_of", "read", "read_part"]
 
-_PER_BYTE = 80.0  # bytes that a byte of ASTERIX takes while it is read and merged, measured; see docs/formats.md
+_PER_BYTE = 30.0  # bytes that a byte of ASTERIX takes while it is read and merged, measured; see docs/formats.md
 
 Progress = Callable[[str, float], None]
 Reader = Callable[[Path, "Told", Progress | None], Part]
@@ -132,8 +132,9 @@ def format_of(path: Path, framing: str | None = None) -> Format:
         if path.suffix.lower() in entry.suffixes:
             return entry
     formats = "; ".join(f"{entry.name} ({', '.join(entry.suffixes)})" for entry in FORMATS)
-    if plain:
-        begins = brief(head[:40].decode("utf-8", "replace").split("\n")[0])
+    first = head[:40].decode("utf-8", "replace").split("\n")[0]
+    if plain and "\ufffd" not in first[:-1]:
+        begins = brief(first)
         advice = "It is text: of text, tables are read that have the suffix .csv and a header line."
     else:
         begins = f"{head[:8].hex(' ')} and not with an ASTERIX block"
