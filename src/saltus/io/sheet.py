@@ -97,13 +97,14 @@ def _read_parquet(path: Path, wanted: Collection[str] | None, memory: float) -> 
     from pyarrow import parquet
 
     try:
-        with parquet.ParquetFile(path) as whole:
+        # opened here, since Arrow takes no name that is no UTF-8
+        with path.open("rb") as opened, parquet.ParquetFile(opened) as whole:
             schema, rows = whole.schema_arrow, whole.metadata.num_rows
         names = [shown(name) for name in schema.names]
         refuse_size(path, rows * PER_ROW, memory, f"{rows} rows")
         at = [schema.names[k] for k in _wanted(path, names, wanted)]
         text = [field.name for field in schema if is_text(field.type)]
-        with parquet.ParquetFile(path, read_dictionary=text) as file:
+        with path.open("rb") as opened, parquet.ParquetFile(opened, read_dictionary=text) as file:
             table, counts = _unpacked(path, file, at, memory)
     except UnicodeDecodeError as error:
         named = brief(bytes(error.object))
@@ -221,16 +222,21 @@ def _cells_of(path: Path, width: int, wrong: list[tuple[int, int]], memory: floa
 
     batches = []
     rows = size = 0
-    with arrow.open_csv(
-        path,
-        read_options=arrow.ReadOptions(column_names=names, use_threads=False, block_size=_BLOCK, encoding="latin-1"),
-        parse_options=arrow.ParseOptions(newlines_in_values=True, invalid_row_handler=note),
-        convert_options=arrow.ConvertOptions(
-            column_types=dict.fromkeys(names, pa.binary()),
-            null_values=list(_EMPTY),
-            strings_can_be_null=True,
-        ),
-    ) as reader:
+    with (
+        path.open("rb") as opened,
+        arrow.open_csv(
+            opened,
+            read_options=arrow.ReadOptions(
+                column_names=names, use_threads=False, block_size=_BLOCK, encoding="latin-1"
+            ),
+            parse_options=arrow.ParseOptions(newlines_in_values=True, invalid_row_handler=note),
+            convert_options=arrow.ConvertOptions(
+                column_types=dict.fromkeys(names, pa.binary()),
+                null_values=list(_EMPTY),
+                strings_can_be_null=True,
+            ),
+        ) as reader,
+    ):
         for batch in reader:
             rows, size = rows + batch.num_rows, size + batch.nbytes
             batches.append(batch)
