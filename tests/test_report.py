@@ -368,7 +368,8 @@ def test_outcomes_are_counted():
 
 
 @pytest.mark.parametrize(
-    ("factor", "verdict"), [(1.0, "consistent"), (1.5, "covariance too small"), (0.6, "covariance too large")]
+    ("factor", "verdict"),
+    [(1.0, "fits"), (0.75, "fits"), (1.3, "noise used is too small"), (0.44, "noise used is too large")],
 )
 def test_innovations_are_judged_by_chi_square(rng, factor, verdict):
     from scipy.stats import chi2
@@ -379,9 +380,8 @@ def test_innovations_are_judged_by_chi_square(rng, factor, verdict):
     (row,) = tables.innovation_rows(pa.table({"source": ["A"] * n, "nis": nis, "dof": dof}))
     assert row.verdict == verdict
     assert row.inside == np.mean(nis <= chi2.ppf(0.95, dof))
-    # mean of z = NIS / dof has variance (2/2 + 2/3) / 2 / n for equal halves; 5 % for the unequal draw of halves
-    assert row.high - 1.0 == pytest.approx(1.96 * np.sqrt((1.0 + 2.0 / 3.0) / 2.0 / n), rel=0.05)
-    assert abs(row.mean / factor - 1.0) < 5.0 * (row.high - 1.0) / 1.96
+    assert (row.low, row.high) == pytest.approx((1.1 - 6.0 / np.sqrt(n), 2.2 + 6.0 / np.sqrt(n)))
+    assert abs(row.mean / factor - 2.0) < 5.0 * 2.0 / np.sqrt(n)
 
 
 def test_any_summary_becomes_tables():

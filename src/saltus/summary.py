@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots
 from saltus.text import say, shown
-from saltus.tracks.health import Health, sensor_health
+from saltus.tracks.health import Health, nis_interval, sensor_health
 from saltus.tracks.measurements import Measurements, Noise
 from saltus.tracks.noise import NoiseEstimate
 from saltus.tracks.rows import Assignments, Rows, join_rows
@@ -179,6 +179,7 @@ def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, 
         row["update_period_s"] = _rounded(sensors.periods[s])
         row["nis_mean"] = _rounded(float(d2[at].mean()) if at.any() else np.nan)
         row["nis_expected"] = 2.0
+        row["nis_interval"] = [_rounded(edge) for edge in nis_interval(int(at.sum()))]
         row["nis_updates"] = int(at.sum())
         table[name if name not in table else f"{name} ({plots.sources[s].system})"] = row
     return table
@@ -285,7 +286,8 @@ def show_summary(summary: dict[str, Any], output: Path, report: bool, systems: S
             for label in row
             if label.startswith("sigma")
         )
-        say(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (expected 2)")
+        low, high = row["nis_interval"]
+        say(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (fits within {low:.2f} to {high:.2f})")
     for name, row in summary["faults"].items():
         if row["judged_plots"]:
             say(_said_of_faults(name, row))

@@ -43,7 +43,6 @@ UNITS: dict[str, dict[str, str]] = {
     "registration": {
         "sigma_offset": "m",
         "sigma_azimuth": "deg",
-        "sigma_elevation": "deg",
         "sigma_range": "m",
         "sigma_time": "s",
         "scatter": "m",

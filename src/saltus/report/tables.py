@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from saltus.report.columns import numbers, texts
+from saltus.tracks.health import nis_interval
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -54,8 +55,8 @@ class InnovationRow(NamedTuple):
 
     source: str
     n: int
-    mean: float  # mean of NIS / degrees of freedom
-    low: float  # 95 % band of that mean were the filter's covariance right
+    mean: float  # mean NIS of two components
+    low: float  # interval of that mean within which the noise fits
     high: float
     inside: float  # share within the 95 % point of chi-square
     verdict: str
@@ -162,9 +163,9 @@ def reason_rows(assignments: "pa.Table") -> list[tuple[str, int, float]]:
 
 
 def innovation_rows(innovations: "pa.Table") -> list[InnovationRow]:
-    """Compare each source's normalised innovation squared with the chi-square law of its degrees of freedom.
+    """Compare each source's normalised innovation squared with what it is where the noise fits (`nis_interval`).
 
-    NIS / dof has mean 1 and variance 2 / dof, so the mean of N has the 95 % band 1 ± 1.96 sqrt(mean(2 / dof) / N).
+    Of updates by more or fewer components than two, NIS counts as 2 NIS / dof.
 
     Source: Bar-Shalom, Li and Kirubarajan (2001), section 5.4.2, in its normal approximation.
     """
@@ -175,11 +176,9 @@ def innovation_rows(innovations: "pa.Table") -> list[InnovationRow]:
     out = []
     for name in dict.fromkeys(source[known].tolist()):
         pick = known & (source == name)
-        n, mean = int(pick.sum()), float(np.mean(nis[pick] / dof[pick]))
-        half = 1.96 * float(np.sqrt(np.mean(2.0 / dof[pick]) / n))
+        n, mean = int(pick.sum()), 2.0 * float(np.mean(nis[pick] / dof[pick]))
+        low, high = nis_interval(n)
         inside = float(np.mean(gammainc(dof[pick] / 2.0, nis[pick] / 2.0) <= 0.95))
-        # A band narrower than 10 % only says that there are many plots, not that the model matters.
-        off = abs(mean - 1.0) > max(half, 0.1)
-        verdict = ("covariance too small" if mean > 1.0 else "covariance too large") if off else "consistent"
-        out.append(InnovationRow(name, n, mean, 1.0 - half, 1.0 + half, inside, verdict))
+        verdict = "noise used is too small" if mean > high else "noise used is too large" if mean < low else "fits"
+        out.append(InnovationRow(name, n, mean, low, high, inside, verdict))
     return out
