@@ -116,7 +116,10 @@ def _table(path: Path, needed: Sequence[str], further: Sequence[str] = ()) -> pa
 def _column(path: Path, table: pa.Table, name: str) -> _Array:
     """Numbers, NaN where a cell is empty; text that holds them is read, and one that does not is refused."""
     faults: list[str] = []
-    values = numbers(path, name, table[name], faults)
+    column = table[name]
+    if name == "turning" and pa.types.is_boolean(column.type):
+        column = column.cast(pa.int8())
+    values = numbers(path, name, column, faults)
     refuse(path, faults)
     return values
 
