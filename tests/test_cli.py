@@ -148,7 +148,7 @@ def test_a_file_that_is_not_there(tmp_path):
     ],
 )
 def test_a_failure_of_the_system_says_what_happened(monkeypatch, error, words):
-    def fails(*_):
+    def fails(*_, **__):
         raise error
 
     monkeypatch.setattr("saltus.info.show_info", fails)

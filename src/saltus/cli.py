@@ -79,9 +79,19 @@ def main() -> None:
 @click.option("--config", type=_FILE, help="TOML file: date, editions.")
 @click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
 @_FRAMING
+@click.option("--full", is_flag=True, help="Read all of large files, not the beginning alone.")
+@click.option("--skeleton", is_flag=True, help="Print a sensors.toml to begin with, and nothing else.")
 @click.option("--system", is_flag=True, help="Say which kernel and instruction set this installation uses.")
-def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, framing: str | None, system: bool) -> None:
-    """Say what is in a recording: systems, counts, time span, period, fields, rejected reports."""
+def info(
+    inputs: tuple[Path, ...],
+    config: Path | None,
+    date: str | None,
+    framing: str | None,
+    full: bool,
+    skeleton: bool,
+    system: bool,
+) -> None:
+    """Say what is in recordings: framing, systems, targets, where and when, items, rejected reports."""
     if system:
         from saltus.filters.backend import system_report
 
@@ -92,7 +102,7 @@ def info(inputs: tuple[Path, ...], config: Path | None, date: str | None, framin
     if inputs:
         from saltus.info import show_info
 
-        show_info(inputs, config, date, framing)
+        show_info(inputs, config, date, framing, full=full, as_skeleton=skeleton)
 
 
 @main.command()
@@ -131,6 +141,46 @@ def track(
     )
     if not summary["tracks"]["confirmed"] and not allow_empty:
         sys.exit(2)
+
+
+@main.command()
+@click.argument("inputs", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--output", required=True, type=_FILE, help="File to write: .parquet, .csv or .jsonl.")
+@click.option("--category", "categories", multiple=True, type=click.IntRange(0, 255), help="Only this category.")
+@click.option("--items", multiple=True, help="Only these items, as 040,070/MODE3A or I048/250.")
+@click.option("--from", "time_from", metavar="TIME", help="First time, HH:MM[:SS] or ISO 8601, UTC.")
+@click.option("--to", "time_to", metavar="TIME", help="Last time, HH:MM[:SS] or ISO 8601, UTC.")
+@click.option("--native", is_flag=True, help="In the units of the format (NM, FL, degrees), not in SI and radians.")
+@click.option("--config", type=_FILE, help="TOML file: date, editions, framing.")
+@click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
+@_FRAMING
+def convert(
+    inputs: tuple[Path, ...],
+    output: Path,
+    categories: tuple[int, ...],
+    items: tuple[str, ...],
+    time_from: str | None,
+    time_to: str | None,
+    native: bool,
+    config: Path | None,
+    date: str | None,
+    framing: str | None,
+) -> None:
+    """Write every decoded item of ASTERIX recordings as a table, one row a record."""
+    from saltus.convert import convert_files
+
+    convert_files(
+        inputs,
+        output,
+        categories=categories,
+        items=items,
+        time_from=time_from,
+        time_to=time_to,
+        native=native,
+        config_path=config,
+        date=date,
+        framing=framing,
+    )
 
 
 @main.command()

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-__all__ = ["REASONS", "Contents", "Datum", "Kind", "Plots", "Recording", "Source", "System", "Traits"]
+__all__ = ["REASONS", "Contents", "Datum", "FileContents", "Kind", "Plots", "Recording", "Source", "System", "Traits"]
 
 # Why a report is not used. Index 0 means usable; readers set the codes below, trackers never change them.
 REASONS = (
@@ -238,6 +238,21 @@ class Contents:
     rejected: dict[str, int]  # reason -> number of target reports
     n_by_type: dict[str, int]  # message or detection type -> number
     notes: tuple[str, ...] = ()
+    words: str = ""  # what such a system is
+    titles: Mapping[str, str] = field(default_factory=dict)  # item -> what it holds
+    site: tuple[float, float, float] | None = None  # as it tells itself: latitude, longitude, rad, height, m
+
+
+@dataclass(frozen=True, slots=True)
+class FileContents:
+    """What one file is, apart from its systems."""
+
+    file: str
+    size: int  # bytes
+    n_read: int  # of these, from the beginning
+    framing: tuple[str, ...] = ()  # in words, what lies around its blocks
+    passed: Mapping[str, int] = field(default_factory=dict)  # packets and frames passed over, by protocol
+    channels: tuple[str, ...] = ()  # lines and connections that carried it
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,3 +263,4 @@ class Recording:
     tracks: pa.Table | None  # CAT062: system, time, track_number, latitude, longitude (deg), vx, vy, ...
     contents: tuple[Contents, ...]
     problems: tuple[str, ...]  # what could not be read, with file and byte or row
+    files: tuple[FileContents, ...] = ()

@@ -116,7 +116,7 @@ def test_formats_joined():
         assert [s.stop - s.start for s in told.segments] == [len(part) for part, _ in parts]
         assert bodies(got) == BODIES[:20] * 7
         assert len(told.problems) == 6
-        assert f"byte {len(parts[0][0])}: the recording goes on as a packet capture" in told.problems[0]
+        assert f"byte {len(parts[0][0])}: the recording goes on as packet capture" in told.problems[0]
 
 
 def test_captures_joined_where_the_first_is_cut_off():

@@ -67,9 +67,13 @@ def explained(
     known, position, covered, n, begins = assigned(), start, start, len(data), False
     for _ in range(_GAPS):
         found = scanner.scan(data, position, n, container, known)
-        fits = position == 0 and final and found.position == n  # from the first byte to the last
+        fits = position == start and final and found.position == n  # from the first byte to the last
         whole = found.frames > found.foreign
-        if whole and (not container.weak or fits or sensible(data, position, container, credible)):
+        if container.weak:
+            believed = (fits and not start) or sensible(data, position, container, credible)
+        else:
+            believed = fits or container.checked or container.fill >= 0 or found.frames >= CHAIN
+        if whole and believed:
             covered += found.position - position
             begins |= position == start
         further = scanner.find(data, min(found.position + 1, n), n, n, container, known, CHAIN)

@@ -139,7 +139,7 @@ class Told:
 def framing_words(name: str) -> str:
     """What a framing is called by people."""
     found = container(name)
-    return found.words if found else {"pcap": "a packet capture (pcap)", "pcapng": "a packet capture (pcapng)"}[name]
+    return found.words if found else {"pcap": "packet capture (pcap)", "pcapng": "packet capture (pcapng)"}[name]
 
 
 def passed_words(kind: int, number: int) -> str:

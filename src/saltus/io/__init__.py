@@ -29,6 +29,7 @@ class Told(NamedTuple):
     editions: Mapping[int, str] = {}  # ASTERIX category -> edition, as "0.23"; categories not named are guessed
     framing: str | None = None  # one of `saltus.framing.NAMES`; None has it guessed
     settings: ReadingSettings = ReadingSettings()  # bounds of reading
+    most: int | None = None  # bytes read of an ASTERIX file, from the beginning; None = all
 
 
 class Format(NamedTuple):
@@ -44,9 +45,11 @@ def _asterix(path: Path, told: Told, progress: Progress | None) -> Part:
     from saltus.io.asterix import read_asterix
     from saltus.io.sheet import refuse_size
 
-    size = path.stat().st_size
+    size = path.stat().st_size if told.most is None else min(path.stat().st_size, told.most)
     refuse_size(path, size * _PER_BYTE, told.settings.memory, f"{size / 1e6:.4g} MB of ASTERIX")
-    return read_asterix(path, date=told.date, editions=told.editions, framing=told.framing, progress=progress)
+    return read_asterix(
+        path, date=told.date, editions=told.editions, framing=told.framing, most=told.most, progress=progress
+    )
 
 
 def _table(path: Path, told: Told, progress: Progress | None) -> Part:

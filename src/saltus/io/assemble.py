@@ -9,35 +9,19 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.asterix.codec import Records, announced
-from saltus.asterix.layout import Layout
+from saltus.asterix.codec import announced
 from saltus.io.categories import CATEGORIES
 from saltus.io.clock import DAY, complete, day_offsets, impossible, told_clock
-from saltus.io.columns import SOURCE, Columns, Decoded
+from saltus.io.columns import SOURCE, Decoded
+from saltus.io.found import Found
 from saltus.io.part import Part, revisit, rotating
 from saltus.records import REASONS, Contents, Kind, Plots, Source, System, Traits
 
-__all__ = ["Found", "assemble"]
+__all__ = ["Found", "Read", "assemble", "read_records", "time_of_day"]
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """The records of one category of a recording."""
-
-    layout: Layout
-    data: npt.NDArray[np.uint8]
-    records: Records
-    columns: Columns
-    sequence: npt.NDArray[np.int64]  # rises in the order in which all records of the recording came
-    clock: npt.NDArray[np.float64]  # s, UTC, when each was captured, NaN = not known
-
-    def __len__(self) -> int:
-        """Number of records."""
-        return len(self.sequence)
-
-
-@dataclass(frozen=True, slots=True)
-class _Read:
+class Read:
     """What became of the records of one category."""
 
     found: Found
@@ -54,7 +38,7 @@ def assemble(
     date: datetime.date | str | None,
 ) -> Part:
     """Turn records into target reports and lines of contents."""
-    read = {number: _read(number, records) for number, records in found.items() if len(records)}
+    read = {number: read_records(number, records) for number, records in found.items() if len(records)}
     times = _times(read, date, name, problems)
     if isinstance(date, str) and read:
         told = told_clock(*(np.concatenate(c) for c in ([r.found.clock for r in read.values()], list(times.values()))))
@@ -77,7 +61,8 @@ def assemble(
             line = _contents(name, system, r, times[number], mine, part, turns)
             extra = ("counted only: no target reports are taken from this category",)
             said = (*notes[number], *(extra if CATEGORIES[number].counted else ()))
-            contents.append(replace(line, fields=dict(sorted(fields.items())), notes=said))
+            titles = {name: r.found.layout.titles.get(name[5:], "") for name in fields}
+            contents.append(replace(line, fields=dict(sorted(fields.items())), notes=said, titles=titles))
     with_reports = [p for p in plots if len(p)] or plots[:1]
     return Part(
         _one_file(Plots.concat(with_reports), name),
@@ -89,13 +74,14 @@ def assemble(
     )
 
 
-def _read(number: int, found: Found) -> _Read:
+def read_records(number: int, found: Found) -> Read:
+    """What becomes of the records of a category."""
     first, stop = found.columns.spans(SOURCE).T
     octets = found.data
     word = octets[first].astype(np.int64) << 8 | octets[np.minimum(first + 1, stop - 1)]
     values, which = np.unique(word, return_inverse=True)
     systems = [System(number, int(v) >> 8, int(v) & 255) for v in values]
-    return _Read(found, _possible(CATEGORIES[number].decode(found.columns)), systems, which.astype(np.int64))
+    return Read(found, _possible(CATEGORIES[number].decode(found.columns)), systems, which.astype(np.int64))
 
 
 def _possible(decoded: Decoded) -> Decoded:
@@ -110,11 +96,11 @@ def _possible(decoded: Decoded) -> Decoded:
 
 
 def _times(
-    read: Mapping[int, _Read], date: datetime.date | str | None, name: str, problems: list[str]
+    read: Mapping[int, Read], date: datetime.date | str | None, name: str, problems: list[str]
 ) -> dict[int, npt.NDArray[np.float64]]:
     """Times of all records, s, UTC: midnights are counted over the whole file, or told by the capture clock."""
     sequence = np.concatenate([r.found.sequence for r in read.values()])
-    tod = np.concatenate([_time_of_day(number, read, name, problems) for number in read])
+    tod = np.concatenate([time_of_day(number, read, name, problems) for number in read])
     if isinstance(date, str):
         clock = np.concatenate([r.found.clock for r in read.values()])
         days = np.round((clock - tod) / DAY)
@@ -129,7 +115,7 @@ def _times(
     return {n: time[a:b] for n, a, b in zip(read, bounds[:-1], bounds[1:], strict=True)}
 
 
-def _time_of_day(number: int, read: Mapping[int, _Read], name: str, problems: list[str]) -> npt.NDArray[np.float64]:
+def time_of_day(number: int, read: Mapping[int, Read], name: str, problems: list[str]) -> npt.NDArray[np.float64]:
     """Times of day of a category's records; truncated ones are completed, or become NaN, and a problem says so."""
     r = read[number]
     modulus = r.decoded.time_modulus
@@ -146,7 +132,7 @@ def _time_of_day(number: int, read: Mapping[int, _Read], name: str, problems: li
     return time
 
 
-def _reference(number: int, read: Mapping[int, _Read]) -> npt.NDArray[np.float64]:
+def _reference(number: int, read: Mapping[int, Read]) -> npt.NDArray[np.float64]:
     """A time of day near each record: the last of its source's service messages, else the next, else its capture."""
     r = read[number]
     near = r.found.clock % DAY
@@ -163,7 +149,7 @@ def _reference(number: int, read: Mapping[int, _Read]) -> npt.NDArray[np.float64
     return near
 
 
-def _plots(name: str, traits: Traits, r: _Read, time: npt.NDArray[np.float64]) -> Plots:
+def _plots(name: str, traits: Traits, r: Read, time: npt.NDArray[np.float64]) -> Plots:
     kinds = np.asarray(r.decoded.columns.get("kind", np.full(len(time), Kind.NONE)))
     sources = tuple(
         Source(s, rotating(traits, kinds[r.system_of == k]), **r.decoded.steps) for k, s in enumerate(r.systems)
@@ -178,7 +164,7 @@ def _plots(name: str, traits: Traits, r: _Read, time: npt.NDArray[np.float64]) -
     return Plots.build(len(time), sources, (name,), columns).take(np.flatnonzero(r.decoded.is_report))
 
 
-def _tracks(r: _Read, table: pa.Table, time: npt.NDArray[np.float64]) -> pa.Table:
+def _tracks(r: Read, table: pa.Table, time: npt.NDArray[np.float64]) -> pa.Table:
     labels = pa.array([str(system) for system in r.systems]).take(pa.array(r.system_of))
     table = table.add_column(0, "system", labels).add_column(1, "time", pa.array(time))
     return table.filter(pa.array(r.decoded.is_report))
@@ -189,7 +175,7 @@ def _one_file(plots: Plots, name: str) -> Plots:
     return replace(plots, files=(name,), file=np.zeros(len(plots), np.int32))
 
 
-def _turns(read: Mapping[int, _Read], times: Mapping[int, npt.NDArray[np.float64]]) -> dict[System, float]:
+def _turns(read: Mapping[int, Read], times: Mapping[int, npt.NDArray[np.float64]]) -> dict[System, float]:
     """Median time between two starts of a cycle of each system that sends them, s."""
     found = {}
     for number, r in read.items():
@@ -203,7 +189,7 @@ def _turns(read: Mapping[int, _Read], times: Mapping[int, npt.NDArray[np.float64
 def _contents(
     name: str,
     system: System,
-    r: _Read,
+    r: Read,
     time: npt.NDArray[np.float64],
     mine: npt.NDArray[np.bool_],
     plots: Plots,
@@ -235,7 +221,18 @@ def _contents(
             decoded.labels.get(int(kind), "type not given" if kind < 0 else f"type {kind}"): int(n)
             for kind, n in zip(kinds, counts, strict=True)
         },
+        words=CATEGORIES[number].words,
+        site=_site(decoded, mine),
     )
+
+
+def _site(decoded: Decoded, mine: npt.NDArray[np.bool_]) -> tuple[float, float, float] | None:
+    """Where a source says that it stands."""
+    if decoded.site is None or not np.isfinite(decoded.site[0][mine]).any():
+        return None
+    told = [v[mine][np.isfinite(v[mine])] for v in decoded.site]
+    latitude, longitude, height = (float(np.median(v)) if len(v) else float("nan") for v in told)
+    return latitude, longitude, height
 
 
 def _source_of(plots: Plots, system: System) -> Source:

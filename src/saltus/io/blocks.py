@@ -61,7 +61,10 @@ def joined(chunks: Sequence[Chunk]) -> Blocks:
 
 
 def read_blocks(
-    path: Path, framing: str | None, progress: Callable[[str, float], None] | None = None
+    path: Path,
+    framing: str | None,
+    progress: Callable[[str, float], None] | None = None,
+    most: int | None = None,
 ) -> tuple[Blocks, Told]:
     """Cut a file into blocks.
 
@@ -69,12 +72,13 @@ def read_blocks(
         path: the file.
         framing: its name; None has it guessed.
         progress: called with the file's name and the share read.
+        most: bytes read, from the beginning; None = all.
 
     Returns:
         The blocks, and what was met.
     """
     framer = Framer(path.name, credible, framing=framing)
-    return joined(list(read_chunks(path, framer, progress=progress))), framer.told
+    return joined(list(read_chunks(path, framer, most=most, progress=progress))), framer.told
 
 
 def looks_like_asterix(data: bytes) -> bool:

@@ -31,6 +31,7 @@ class Decoded(NamedTuple):
     columns: Mapping[str, npt.ArrayLike]  # columns of Plots
     new_cycle: Mask  # north markers and starts of an update cycle
     steps: Mapping[str, float]  # quantisation: fields of Source
+    site: tuple[Numbers, Numbers, Numbers] | None = None  # told by the source: latitude, longitude, rad, height, m
     tracks: pa.Table | None = None  # columns of another system's tracks, one row for each record
     time_modulus: float = 0.0  # s: times of day are given modulo this; 0 = whole
 
@@ -39,16 +40,15 @@ class Decoded(NamedTuple):
 class Category:
     """What to take from the records of one category, and how to read it.
 
-    `fields` are the paths taken (those that an edition does not have stay absent); `decode` makes sense of them.
-    `plausible` says how well the numbers hang together (0 to 1): it decides between editions whose definitions both
-    parse. `traits` are those of every source of the category; that one rotates is told by its reports. `turns` is the
-    category of the service messages that tell the update cycle of its sources.
+    `words` say what its sources are. `fields` are the paths taken (those that an edition does not have stay absent);
+    `decode` makes sense of them. `traits` are those of every source of the category; that one rotates is told by its
+    reports. `turns` is the category of the service messages that tell the update cycle of its sources.
     """
 
     number: int
+    words: str
     fields: tuple[str | Want, ...]
     decode: Callable[["Columns"], Decoded]
-    plausible: Callable[["Columns"], float] | None = None
     traits: Traits = Traits()
     turns: int | None = None
     counted: bool = False  # no target reports are taken
@@ -128,8 +128,10 @@ def first_reason(n: int, cases: Mapping[str, Mask]) -> npt.NDArray[np.int8]:
     return reason
 
 
-def status(c: Columns, time: str, message: str = "", cycle: int = -1) -> Decoded:
-    """Records that are no target reports: their time, the type of message, and which of them starts a cycle."""
+def status(
+    c: Columns, time: str, message: str = "", cycle: int = -1, site: tuple[str, str, str] | None = None
+) -> Decoded:
+    """Records that are no target reports: their time, the type of message, which starts a cycle, the source's site."""
     kinds = c.code(message)
     return Decoded(
         time_of_day=c.number(time),
@@ -139,4 +141,5 @@ def status(c: Columns, time: str, message: str = "", cycle: int = -1) -> Decoded
         columns={},
         new_cycle=kinds == cycle if cycle >= 0 else np.zeros(c.n, np.bool_),
         steps={},
+        site=None if site is None else (c.number(site[0]), c.number(site[1]), c.number(site[2])),
     )

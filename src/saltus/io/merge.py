@@ -69,6 +69,7 @@ def merge(parts: Sequence[Part]) -> Recording:
             _count(line, plots, int(k)) for k, part in zip(first_file, parts, strict=False) for line in part.contents
         ),
         problems=tuple(p for part in parts for p in part.problems) + tuple(problems),
+        files=tuple(part.file for part in parts if part.file is not None),
     )
 
 

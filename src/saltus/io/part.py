@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.records import Contents, Kind, Plots, System, Traits
+from saltus.records import Contents, FileContents, Kind, Plots, System, Traits
 from saltus.shapes import Int
 from saltus.text import shown
 
@@ -28,6 +28,7 @@ class Part(NamedTuple):
     problems: tuple[str, ...]
     in_order: bool  # the order of the reports is the order of reception (not so in tables)
     dated: bool  # the file tells the date itself
+    file: FileContents | None = None
 
 
 def rotating(traits: Traits, kind: npt.NDArray[np.integer]) -> Traits:
@@ -56,7 +57,9 @@ def printable(part: Part) -> Part:
         )
         for line in part.contents
     )
-    return part._replace(plots=plots, contents=lines, problems=tuple(shown(told) for told in part.problems))
+    about = part.file and replace(part.file, file=shown(part.file.file))
+    problems = tuple(shown(told) for told in part.problems)
+    return part._replace(plots=plots, contents=lines, problems=problems, file=about)
 
 
 def revisit(time: npt.ArrayLike, *identities: Int[np.ndarray, " n"]) -> float:

@@ -1,10 +1,8 @@
 """`saltus track`: recordings in, tracks, assignments, summary and report out."""
 
-import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +27,13 @@ from saltus.run.identified import (
 )
 from saltus.run.pipeline import Identified, track_plots
 from saltus.summary import Sensors, Tracked, health_of, noise_rows, show_summary, summarise, why_no_track
+from saltus.times import parse_time, time_window
 from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.rows import Rows, join_rows
 
 __all__ = ["parse_time", "track_files", "track_recording", "write_tracks"]
 
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
-_DAY = 86400.0  # s
 _REPORT = "report.html"
 _MANY = 100  # positions of a source that should have made a track
 _NO_PERIOD = 4.0  # s: update period where the recording does not tell
@@ -169,43 +167,6 @@ def track_recording(
     return plots, tracks, assignment_table(plots, tracked.measurements, tracked.assignments)
 
 
-def parse_time(text: str, start: float) -> float:
-    """Read HH:MM[:SS] of the day of `start` (UTC seconds), or ISO 8601 (UTC unless it says otherwise)."""
-    if re.fullmatch(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?", text):
-        hours, minutes, *seconds = (float(part) for part in text.split(":"))
-        if hours < 24 and minutes < 60 and sum(seconds) < 60:
-            return float(np.floor(start / 86400.0) * 86400.0 + 3600.0 * hours + 60.0 * minutes + sum(seconds))
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError as error:
-        raise DataError(f"{text!r} is no time; write HH:MM, HH:MM:SS or 2023-05-02T08:00:00 (UTC).") from error
-    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
-
-
-def _window(time_from: str | None, time_to: str | None, start: float, end: float) -> tuple[float, float]:
-    """Read --from and --to against the span of the recording; past midnight, a time of day before is the next day's."""
-    past_midnight = np.floor(end / _DAY) > np.floor(start / _DAY)
-
-    def read(text: str, not_before: float) -> float:
-        moment = parse_time(text, start)
-        return moment + _DAY if past_midnight and "-" not in text and moment < not_before else moment
-
-    first = start if time_from is None else read(time_from, start)
-    last = end if time_to is None else read(time_to, first)
-    if first > last and time_from is not None and time_to is not None:
-        raise DataError(f"--from {time_from} is after --to {time_to}: {_utc(first)} and {_utc(last)} (UTC).")
-    if first > last or first > end or last < start:
-        raise DataError(
-            f"every report is outside time window {_utc(first)} to {_utc(last)}: the recording lasts from "
-            f"{_utc(start)} to {_utc(end)} (UTC). Give --from and --to inside it, as HH:MM:SS or 2023-05-02T08:00:00."
-        )
-    return first, last
-
-
-def _utc(seconds: float) -> str:
-    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")
-
-
 def _prepare(
     recording: Recording, config: Config, time_from: str | None, time_to: str | None
 ) -> tuple[Plots, Sensors, list[str]]:
@@ -214,7 +175,7 @@ def _prepare(
     reason = plots.reason.copy()
     usable = (reason == 0) & np.isfinite(plots.time)
     if usable.any():
-        first, last = _window(time_from, time_to, float(plots.time[usable].min()), float(plots.time[usable].max()))
+        first, last = time_window(time_from, time_to, float(plots.time[usable].min()), float(plots.time[usable].max()))
         early = plots.time < (-np.inf if time_from is None else first)
         late = plots.time > (np.inf if time_to is None else last)
         reason[early | late] = REASONS.index("outside time window")  # whatever else was wrong with them

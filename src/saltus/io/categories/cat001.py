@@ -72,4 +72,4 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT001 = Category(1, _FIELDS, _decode, turns=2)
+CAT001 = Category(1, "monoradar plots and tracks of older radars", _FIELDS, _decode, turns=2)

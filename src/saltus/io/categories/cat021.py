@@ -122,28 +122,13 @@ def _of(table: Numbers, codes: np.ndarray) -> Numbers:
     return np.where(known, table[np.where(known, codes, 0)], np.nan)
 
 
-def _plausible(c: Columns) -> float:
-    """Share of reports whose time follows the one before within 10 minutes and whose latitude exists.
-
-    Read in the wrong edition, times and positions are other items' bytes.
-    """
-    time = _time(c)
-    latitude, _, _ = _position(c)
-    times, latitudes = time[~np.isnan(time)], latitude[~np.isnan(latitude)]
-    if len(times) < 2 or not len(latitudes):
-        return 0.0
-    near = np.abs((np.diff(times) + 43200) % 86400 - 43200) < 600
-    share = np.mean(near) * np.mean(np.abs(latitudes) <= np.pi / 2) * len(times) / c.n
-    return float(share)
-
-
 # A transponder at rest on the ground tells its position every 5 s; one without a clock of its own sends a position up
 # to 0.1 s off the time it is received at.
 CAT021 = Category(
     21,
+    "ADS-B reports of a ground station",
     _FIELDS,
     _decode,
-    _plausible,
-    Traits(self_reporting=True, rest_period=5.0, sigma_time=0.2 / 12.0**0.5),
+    traits=Traits(self_reporting=True, rest_period=5.0, sigma_time=0.2 / 12.0**0.5),
     turns=None,
 )

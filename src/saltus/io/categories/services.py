@@ -19,33 +19,36 @@ from saltus.io.columns import Category, status
 __all__ = ["SERVICES"]
 
 
-def _service(number: int, time: str, message: str, cycle: int = -1) -> Category:
-    return Category(number, (time, message), partial(status, time=time, message=message, cycle=cycle))
+def _service(
+    number: int, words: str, time: str, message: str, cycle: int = -1, site: tuple[str, str, str] | None = None
+) -> Category:
+    decode = partial(status, time=time, message=message, cycle=cycle, site=site)
+    return Category(number, words, (time, message, *(site or ())), decode)
 
 
-def _counted(number: int, time: str, message: str = "") -> Category:
-    return Category(number, (time, message), partial(status, time=time, message=message), counted=True)
+def _counted(number: int, words: str, time: str, message: str = "") -> Category:
+    return Category(number, words, (time, message), partial(status, time=time, message=message), counted=True)
 
 
 SERVICES = (
-    _service(2, "030", "000", cycle=1),
-    _service(19, "140", "000", cycle=1),
-    _service(34, "030", "000", cycle=1),
-    _counted(23, "070", "000"),
-    _counted(63, "030"),
-    _counted(65, "030", "000"),
-    _counted(4, "020", "000"),
-    _counted(7, "140"),
-    _counted(8, "090", "000"),
-    _counted(9, "070", "000"),
-    _counted(15, "145", "000/MT"),
-    _counted(16, "140", "000"),
-    _counted(17, "140", "000"),
-    _counted(18, "002", "000"),
-    _counted(25, "070", "000/RTYP"),
-    _counted(32, "020"),
-    _counted(150, "", "080"),
-    _counted(205, "030", "000"),
-    _counted(240, "140", "000"),
-    _counted(247, "140"),
+    _service(2, "service messages of older radars", "030", "000", cycle=1),
+    _service(19, "status of a multilateration system", "140", "000", cycle=1, site=("600/LAT", "600/LON", "610")),
+    _service(34, "service messages of a radar", "030", "000", cycle=1, site=("120/LAT", "120/LON", "120/HGT")),
+    _counted(23, "status of an ADS-B ground station", "070", "000"),
+    _counted(63, "status of a centre's sensors", "030"),
+    _counted(65, "status of a surveillance centre", "030", "000"),
+    _counted(4, "safety net messages", "020", "000"),
+    _counted(7, "combined Mode S reports", "140"),
+    _counted(8, "weather seen by a radar", "090", "000"),
+    _counted(9, "weather of several radars", "070", "000"),
+    _counted(15, "reports of independent non-cooperative sensors", "145", "000/MT"),
+    _counted(16, "configuration of independent non-cooperative sensors", "140", "000"),
+    _counted(17, "coordination of Mode S radars", "140", "000"),
+    _counted(18, "Mode S data link messages", "002", "000"),
+    _counted(25, "status of ground systems", "070", "000/RTYP"),
+    _counted(32, "flight plans in short", "020"),
+    _counted(150, "flight plan messages", "", "080"),
+    _counted(205, "bearings of radio direction finders", "030", "000"),
+    _counted(240, "radar video", "140", "000"),
+    _counted(247, "version numbers", "140"),
 )

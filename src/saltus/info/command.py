@@ -1,0 +1,223 @@
+"""`saltus info`: what is in recordings, in words and figures."""
+
+import datetime
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+from pathlib import Path
+
+import click
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from saltus.config import Config, load_config
+from saltus.errors import DataError, SaltusError
+from saltus.info.figures import extents, levels, targets
+from saltus.info.skeleton import skeleton
+from saltus.io import Told, read_part
+from saltus.io.inputs import expand
+from saltus.io.merge import merge
+from saltus.io.part import Part
+from saltus.records import Contents, FileContents, Plots, Recording
+from saltus.text import shown
+
+__all__ = ["show_info"]
+
+_PLAIN_WIDTH = 120  # columns when the output is no terminal
+_DAY = 86400.0  # s
+_HEAD = 1 << 22  # bytes of a recording that tell what is in it
+_CHANNELS = 6  # named one by one
+
+
+def show_info(
+    inputs: Sequence[Path],
+    config_path: Path | None = None,
+    date: str | None = None,
+    framing: str | None = None,
+    *,
+    full: bool = False,
+    as_skeleton: bool = False,
+) -> None:
+    """Print what recordings hold: framing, systems, targets, where and when, items, rejected reports.
+
+    Of large ASTERIX files the beginning is read, unless all is asked for. Files that cannot be read are named after
+    all others are shown.
+
+    Args:
+        inputs: files, directories, patterns.
+        config_path: TOML file with date, editions and sensors, or None.
+        date: YYYY-MM-DD of the first record; goes before the configuration's.
+        framing: one of `saltus.framing.NAMES`; None has it guessed.
+        full: read all of every file.
+        as_skeleton: print a configuration to begin with, and nothing else.
+
+    Raises:
+        DataError: files cannot be read at all.
+        ModelError: the configuration or the date is wrong.
+    """
+    config = load_config(config_path, date=date, framing=framing)
+    told = Told(config.date, config.editions, config.framing, config.reading, None if full else _HEAD)
+    parts: list[Part] = []
+    failures: dict[str, SaltusError | OSError] = {}
+    for path in expand(inputs):
+        try:
+            parts.append(read_part(path, told))
+        except (SaltusError, OSError) as error:
+            failures.setdefault(str(error), error)
+    if parts and as_skeleton:
+        click.echo(skeleton(merge(parts)), nl=False)
+    elif parts:
+        console = Console(highlight=False)
+        if not console.is_terminal:
+            console = Console(highlight=False, width=_PLAIN_WIDTH)
+        _show(console, merge(parts), config)
+    if len(failures) == 1:
+        raise next(iter(failures.values()))
+    if failures:
+        raise DataError("\n".join(failures))
+
+
+def _show(console: Console, recording: Recording, config: Config) -> None:
+    plots = recording.plots
+    about = {f.file: f for f in recording.files}
+    names = {name: k for k, name in enumerate(plots.files)}
+    for file, lines in groupby(recording.contents, key=lambda c: c.file):
+        console.print(Text(file, style="bold"))
+        if file in about:
+            console.print(Padding(_file(about[file]), (0, 0, 1, 2)))
+        some = list(lines)
+        for line in some:
+            mine = plots.take(_of(plots, line, names.get(file, -1)))
+            console.print(Padding(_system(line, mine, config), (0, 0, 1, 2)))
+        for items in _items(some):
+            console.print(Padding(items, (0, 0, 1, 2)))
+    usable = int(np.count_nonzero(plots.reason == 0))
+    console.print(f"{len(plots)} target reports, {usable} usable, {len(plots) - usable} rejected")
+    if recording.tracks is not None:
+        console.print(f"{recording.tracks.num_rows} reports are another system's tracks: kept apart, never plots")
+    for problem in recording.problems:
+        console.print(Text("problem: ", style="yellow") + Text(problem))
+
+
+def _of(plots: Plots, line: Contents, file: int) -> npt.NDArray[np.bool_]:
+    own = [k for k, s in enumerate(plots.sources) if s.system == line.system]
+    mine: npt.NDArray[np.bool_] = (plots.file == file) & np.isin(plots.source, own)
+    return mine
+
+
+def _grid() -> Table:
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(style="cyan", no_wrap=True)
+    grid.add_column(overflow="fold")
+    return grid
+
+
+def _file(file: FileContents) -> Table:
+    """How a file is framed, and what of it was looked at."""
+    grid = _grid()
+    for words in file.framing:
+        grid.add_row("framing", Text(words))
+    if file.n_read < file.size:
+        share = f"{file.n_read / file.size:.1%}"
+        grid.add_row("read", Text(f"the first {_size(file.n_read)} of {_size(file.size)} ({share}); --full reads all"))
+    if file.channels:
+        more = f", and {len(file.channels) - _CHANNELS} more" if len(file.channels) > _CHANNELS else ""
+        grid.add_row("channels", Text(f"{len(file.channels)}: {', '.join(file.channels[:_CHANNELS])}{more}"))
+    if file.passed:
+        grid.add_row("passed over", Text(_counts(file.passed)))
+    return grid
+
+
+def _system(line: Contents, plots: Plots, config: Config) -> Table:
+    """One system as a grid of two columns."""
+    grid = _grid()
+    site = config.site_for(line.system)
+    named = f"  {shown(site.name)}" if site and shown(site.name) != line.system.name else ""
+    edition = f"  edition {line.edition}" if line.edition else ""
+    words = f"  {line.words}" if line.words else ""
+    grid.add_row(Text(str(line.system), style="bold"), Text(f"{named}{edition}{words}".strip()))
+    grid.add_row("records", f"{line.n_records}, of these {line.n_reports} target reports")
+    if line.n_reports:
+        grid.add_row("targets", Text(targets(plots)))
+    grid.add_row("time", _span(line))
+    period = "cannot be told" if np.isnan(line.update_period) else f"{line.update_period:.3f} s"
+    grid.add_row("update", period)
+    for where in extents(plots):
+        grid.add_row("extent", Text(where))
+    if line.site is not None:
+        grid.add_row("site", Text(_place(*line.site)))
+    high = levels(plots)
+    if high:
+        grid.add_row("levels", Text(high))
+    if line.n_by_type:
+        grid.add_row("types", Text(_counts(line.n_by_type)))
+    if line.n_reports:
+        rejected = sum(line.rejected.values())
+        usable = f"{line.n_reports - rejected} usable"
+        grid.add_row("rejected", Text(f"{_counts(line.rejected)} ({usable})" if rejected else f"none ({usable})"))
+    if line.fields and not line.titles:
+        grid.add_row("fields", Text(_counts(line.fields)))
+    for note in line.notes:
+        grid.add_row("note", Text(note))
+    return grid
+
+
+def _place(latitude: float, longitude: float, height: float) -> str:
+    above = f", {height:.1f} m" if np.isfinite(height) else ""
+    return f"{np.degrees(latitude):.6f}, {np.degrees(longitude):.6f} degrees{above}, as it tells itself"
+
+
+def _items(lines: Sequence[Contents]) -> list[RenderableType]:
+    """Of each category the items that its systems send: number, words, how many records carry it."""
+    shown_items: list[RenderableType] = []
+    for (category, edition), group in groupby(
+        sorted((c for c in lines if c.titles), key=lambda c: (c.system.category or 0, c.edition)),
+        key=lambda c: (c.system.category, c.edition),
+    ):
+        some = list(group)
+        count: Counter[str] = Counter()
+        titles: dict[str, str] = {}
+        for line in some:
+            count.update(line.fields)
+            titles |= line.titles
+        n = sum(line.n_records for line in some)
+        table = Table.grid(padding=(0, 2))
+        table.add_column(style="cyan", no_wrap=True)
+        table.add_column(overflow="fold")
+        table.add_column(justify="right")
+        table.add_column(justify="right")
+        for name in sorted(count):
+            table.add_row(Text(name), Text(titles[name]), str(count[name]), f"{count[name] / n:.0%}")
+        shown_items.append(Group(Text(f"items of category {category}, edition {edition}", style="bold"), table))
+    return shown_items
+
+
+def _counts(table: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {n}" for name, n in table.items())
+
+
+def _size(n: int) -> str:
+    """Bytes in words."""
+    return f"{n / 1e6:.1f} MB" if n >= 1e5 else f"{n} bytes"
+
+
+def _span(line: Contents) -> str:
+    if np.isnan(line.time_from):
+        return "not told"
+    seconds = line.time_to - line.time_from
+    length = f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.3f} s"
+    return f"{_moment(line.time_from)} to {_moment(line.time_to)} UTC ({length})"
+
+
+def _moment(time: float) -> str:
+    """Date and time of day; without a date (counted from 1970-01-01) the time of day alone."""
+    moment = datetime.datetime.fromtimestamp(round(time, 3), datetime.UTC)
+    shown = moment.strftime("%H:%M:%S.") + f"{moment.microsecond // 1000:03d}"
+    if -_DAY <= time < 10 * _DAY:
+        days = int(time // _DAY)
+        return shown + (f" (+{days} d)" if days else "")
+    return f"{moment:%Y-%m-%d} {shown}"
