@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 NATIVE := CMakeLists.txt $(wildcard native/*)
 DOCS_READY := $(VENV)/.docs-ready
 
-.PHONY: demo test crash check format docs wheel bench bench-asterix sanitize clean
+.PHONY: demo test crash check format docs wheel bench bench-asterix sanitize fuzz clean
 
 demo: $(READY)
 	$(BIN)/saltus demo -o out/demo
@@ -61,6 +61,19 @@ sanitize: $(READY)
 	  PYTHONPATH="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" \
 	  build/sanitize/bin/python -m pytest tests/native tests/asterix tests/filters/test_imm.py tests/filters/test_bank.py \
 	  tests/filters/test_coloured.py
+
+# Every reader under mutated inputs, guided by the branches they reach, for so many seconds each; the fuzzer lives in an
+# environment of its own that borrows the packages of .venv. What fails goes to tests/fuzz/corpus.
+FUZZ_SECONDS ?= 900
+fuzz: $(READY)
+	mkdir -p build/fuzz
+	$(PYTHON) -m venv build/fuzz/venv
+	build/fuzz/venv/bin/python -m pip install -q atheris==3.1.0
+	$(BIN)/python -c 'import sysconfig; print("import site; site.addsitedir(%r)" % sysconfig.get_path("purelib"))' \
+	  > "$$(build/fuzz/venv/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth"
+	for target in $$($(BIN)/python tests/fuzz/long.py --list); do \
+	  build/fuzz/venv/bin/python tests/fuzz/long.py --guided --seconds $(FUZZ_SECONDS) --target $$target || exit 1; \
+	done
 
 $(READY): pyproject.toml $(NATIVE)
 	$(PYTHON) -m venv $(VENV)

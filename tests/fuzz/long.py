@@ -83,8 +83,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--target", nargs="*", help="targets; all by default")
     parser.add_argument("--guided", action="store_true", help="with atheris, one target")
+    parser.add_argument("--list", action="store_true", help="print the targets")
     given = parser.parse_args()
     known = targets()
+    if given.list:
+        print(" ".join(known))
+        return
     chosen = [known[name] for name in given.target or known]
     if given.guided:
         guided(chosen[0], given.seconds, given.seed)
