@@ -102,7 +102,7 @@ def test_a_record_without_values_changes_nothing_that_follows(nonlinear):
     seen = [(0.0, "s", [3e3, 4e3]), (8.0, "s", [3.2e3, 3.8e3]), (9.0, "s", [3.2e3, 3.8e3])]
     without = IMM(a_model({"s": sensor}), per_mode=True).run(seen)
     between = IMM(a_model({"s": sensor}), per_mode=True).run([seen[0], (4.0, "s", [np.nan] * 2), *seen[1:]])
-    assert without.findings == between.findings == ()
+    assert "per-interval" not in {f.kind for f in (*without.findings, *between.findings)}
     # Modes are mixed at the record: the chain's law is that over the whole interval, the mixed moments are not.
     one = IMM(a_model({"s": sensor}, chains=(), dynamics=constant_velocity(2, accel=3.0)))
     for name in ("mean", "cov", "log_likelihood"):
@@ -114,8 +114,8 @@ def test_motion_per_interval_is_told_where_intervals_differ():
     scan = a_model({"s": PositionSensor(2, 1.0)}, dynamics=constant_velocity(2, accel=1.0, kind="scan"))
     rows = [(t, "s", [3e3, 4e3]) for t in (0.0, 4.0, 8.0, 16.0)]
     for bound in (IMM(scan), ExactFilter()(scan)):
-        assert [f.kind for f in bound.run(rows).findings] == ["per-interval"]
-        assert bound.run(rows[:3]).findings == ()
+        assert "per-interval" in {f.kind for f in bound.run(rows).findings}
+        assert "per-interval" not in {f.kind for f in bound.run(rows[:3]).findings}
     drawn = ParticleFilter(n=16, groups=2)(scan).run(rows, rng=np.random.default_rng(1))
     assert [f.kind for f in drawn.findings] == ["per-interval"]
 

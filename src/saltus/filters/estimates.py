@@ -34,14 +34,17 @@ class Estimates:
         error: the filter's own error estimate (reference filters), else None: how far the mean may be from the exact
             one, in posterior standard deviations, (*batch, T).
         effective: share of the particles that count after each measurement (particle filters), else None.
+        lost: at most how many nats were thrown away when histories of modes were merged or dropped before each row's
+            measurement (`saltus.filters.merging`), (*batch, T): of `exact_filter`, and of `IMM(model).run` but for
+            coloured noise; else None. The more, the farther the mean may be from the optimum.
         pairs: of smoothers: P(state i one row before, j now | all measurements used) of each chain,
             (*batch, T, Mc, Mc), row 0 from the prior; else None.
         chain_probs: of smoothers: law of each chain by its pairs, (*batch, T, Mc), free of the last mixing's error and
             so better than the marginals of `probs`; else None.
         chains: names of the chains, in axis order.
         times: times of the rows in s, or None.
-        findings: what is doubtful about the model with these times (filters of a described model), as
-            `HybridModel.check` says it.
+        findings: what is doubtful: about the model with these times, as `HybridModel.check` says it; `merging` that
+            throws away much; measurements that are `unexplained`.
     """
 
     probs: Float[np.ndarray, "*modes"]
@@ -55,6 +58,7 @@ class Estimates:
     mode_covs: Float[np.ndarray, "*modes n n"] | None = None
     error: Float[np.ndarray, "*rows"] | None = None
     effective: Float[np.ndarray, "*rows"] | None = None
+    lost: Float[np.ndarray, "*rows"] | None = None
     pairs: tuple[Float[np.ndarray, "..."], ...] | None = None
     chain_probs: tuple[Float[np.ndarray, "..."], ...] | None = None
     chains: tuple[str, ...] = ()

@@ -142,23 +142,25 @@ class _Row(NamedTuple):
     log_likelihood: _Array
     nis: _Array
     error: _Array
+    lost: _Array
     mode_means: _Array | None
     mode_covs: _Array | None
 
 
 def _filter(model: Aligned, flat: Flat, rule: MergingRule, per_mode: bool) -> Estimates:
     now, lost = _start(flat), np.zeros(flat.n_runs)
+    since = lost  # the row before
     rows = []
     for k in range(flat.n_steps):
         now, modes = _branch(now, flat.trans(k), rule, k)
         if rule.before and rule.last is not None:
             now, cost = merged(now, flat.n_modes**rule.last)
-            lost = lost + cost
+            since = since + cost
             modes = np.tile(np.arange(flat.n_modes), flat.n_modes ** (rule.last - 1))
+        lost = lost + since
         now, log_f, nis = _update(now, modes, flat, k)
-        rows.append(_row(now, modes, flat.n_modes, log_f, nis, np.sqrt(2.0 * lost), per_mode))
-        now, cost = _reduced(now, modes, flat.n_modes, rule)
-        lost = lost + cost
+        rows.append(_row(now, modes, flat.n_modes, log_f, nis, np.sqrt(2.0 * lost), since, per_mode))
+        now, since = _reduced(now, modes, flat.n_modes, rule)
     return _estimates(rows, model)
 
 
@@ -212,7 +214,14 @@ def _update(now: Histories, modes: _Codes, flat: Flat, k: int) -> tuple[Historie
 
 
 def _row(
-    now: Histories, modes: _Codes, n_modes: int, log_f: _Array, nis: _Array, error: _Array, per_mode: bool
+    now: Histories,
+    modes: _Codes,
+    n_modes: int,
+    log_f: _Array,
+    nis: _Array,
+    error: _Array,
+    lost: _Array,
+    per_mode: bool,
 ) -> _Row:
     log_probs = now.log_probs[..., 0]
     mean, cov = steps.collapse(log_probs, now.means, now.covs, 1)
@@ -227,6 +236,7 @@ def _row(
         log_f,
         nis,
         error,
+        lost,
         None if by_mode is None else by_mode.means,
         None if by_mode is None else by_mode.covs,
     )
@@ -276,4 +286,5 @@ def _estimates(rows: Sequence[_Row], model: Aligned) -> Estimates:
         mode_means=column([r.mode_means for r in rows], *sizes, n) if by_mode else None,
         mode_covs=column([r.mode_covs for r in rows], *sizes, n, n) if by_mode else None,
         error=column([r.error for r in rows]),
+        lost=column([r.lost for r in rows]),
     )

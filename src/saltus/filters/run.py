@@ -11,8 +11,8 @@ from saltus.errors import DataError, ModelError, SaltusError
 from saltus.filters import steps
 from saltus.filters.coloured_run import filter_coloured
 from saltus.filters.estimates import Estimates, described
-from saltus.filters.imm import imm_filter
 from saltus.filters.linearise import Linearisation, sensor_update
+from saltus.filters.merging import filter_and_tell, findings, merging_loss
 from saltus.filters.refusals import check_evidence
 from saltus.models import Arrays, BoundSensor, HybridModel, LinearSensor, Observer
 from saltus.models.augment import coloured_sensors
@@ -106,7 +106,7 @@ class IMM:
         names = [record.sensor for record in records]
         layout, arrays = model.arrays_for(times, names)
         z = layout.stack(names, [record.z for record in records])
-        return imm_filter(z, **arrays._asdict(), per_mode=self.per_mode)
+        return filter_and_tell(z, arrays, self.per_mode)
 
     def _one_by_one(self, model: HybridModel, records: Sequence[Record], times: _Array) -> Estimates:
         arrays = model.compile(times=times, sensor=())
@@ -117,14 +117,17 @@ class IMM:
             log_probs, np.broadcast_to(arrays.mean0, (*sizes, n)), np.broadcast_to(arrays.cov0, (*sizes, n, n))
         )
         sensors = {name: sensor for name, sensor in model.sensors.items() if isinstance(sensor, BoundSensor)}
-        rows = []
+        rows, lost = [], []
         for k, record in enumerate(records):
             sensor = _sensor_of(sensors, record, k)
             z = _checked(record, sensor, k)
-            row = self._step(_predicted(belief, arrays, k), sensor, z, k)
+            mixed = steps.mix(*belief, [_of_row(trans, k, 2) for trans in arrays.trans])
+            lost.append(float(merging_loss(belief, mixed, len(sizes))))
+            row = self._step(_propagated(mixed, arrays, k), sensor, z, k)
             belief = row.belief
             rows.append(row)
-        return _estimates(rows, self.per_mode)
+        told = np.array(lost)
+        return replace(_estimates(rows, self.per_mode), lost=told, findings=findings(told, n))
 
     def _step(self, belief: steps.Belief, sensor: BoundSensor, z: _Array, k: int) -> "_Row":
         """Condition every mode on one measurement, and the modes."""
@@ -175,17 +178,16 @@ def in_order(
     return listed, times
 
 
-def _predicted(belief: steps.Belief, arrays: Arrays, k: int) -> steps.Belief:
-    """Mix and propagate over the interval that ends at record k."""
+def _propagated(belief: steps.Belief, arrays: Arrays, k: int) -> steps.Belief:
+    """Move mixed modes over the interval that ends at record k."""
     n_chains = belief.log_probs.ndim
+    b = None if arrays.b is None else _of_row(arrays.b, k, n_chains + 1)
+    F, Q = _of_row(arrays.F, k, n_chains + 2), _of_row(arrays.Q, k, n_chains + 2)
+    return steps.Belief(belief.log_probs, *steps.propagate(belief.means, belief.covs, F, b, Q))
 
-    def at(a: _Array, n_constant: int) -> _Array:
-        return a[k if len(a) > 1 else 0] if a.ndim > n_constant else a
 
-    log_probs, means, covs = steps.mix(*belief, [at(trans, 2) for trans in arrays.trans])
-    b = None if arrays.b is None else at(arrays.b, n_chains + 1)
-    F, Q = at(arrays.F, n_chains + 2), at(arrays.Q, n_chains + 2)
-    return steps.Belief(log_probs, *steps.propagate(means, covs, F, b, Q))
+def _of_row(a: _Array, k: int, n_constant: int) -> _Array:
+    return a[k if len(a) > 1 else 0] if a.ndim > n_constant else a
 
 
 def _sensor_of(sensors: Mapping[str, BoundSensor], record: Record, k: int) -> BoundSensor:

@@ -31,6 +31,23 @@ class Arrays(NamedTuple):
     cov0: FloatArray  # (M1|1, ..., MC|1, n, n)
     probs0: FloatArray  # (M1, ..., MC)
 
+    def rows(self, piece: slice) -> "Arrays":
+        """The arrays of a piece of the rows, with the same prior."""
+        C = self.probs0.ndim
+
+        def cut(a: FloatArray, constant: int) -> FloatArray:
+            return a[piece] if a.ndim > constant and len(a) > 1 else a
+
+        return self._replace(
+            F=cut(self.F, C + 2),
+            Q=cut(self.Q, C + 2),
+            H=cut(self.H, C + 2),
+            R=cut(self.R, C + 2),
+            trans=tuple(cut(t, 2) for t in self.trans),
+            b=None if self.b is None else cut(self.b, C + 1),
+            d=None if self.d is None else cut(self.d, C + 1),
+        )
+
 
 class Layout(NamedTuple):
     """Which components of a stacked measurement belong to which sensor."""
