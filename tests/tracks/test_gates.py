@@ -9,7 +9,7 @@ from tracking_scenes import measured
 
 from saltus.records import Kind
 from saltus.tracks.faults import SourceCondition, plot_law
-from saltus.tracks.gates import Gate
+from saltus.tracks.gates import Gate, distances, predict
 from saltus.tracks.kinematics import Start, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.settings import FilterSettings, TrackerSettings
@@ -222,3 +222,27 @@ def test_gates_widen_when_the_source_is_probably_degraded(prior, share):
     m = measured(np.full(20, DT), plots + np.array([4.9 * np.sqrt(P), 0.0]), 100.0)
     found, _ = gated(STEADY, mean, m, probability=0.9999, prior=np.array(prior))
     assert len(found.pairs.plot) == 20 * share
+
+
+def test_first_plots_are_compared_with_all_that_their_gates_hold_and_no_more(rng):
+    """Dense plots a slice later, against every pair's distance by the filter's own prediction."""
+    n = 300
+    mean, cov = np.zeros((n, 6)), np.zeros((n, 6, 6))
+    mean[:, 0:3:2] = rng.uniform(-15e3, 15e3, (n, 2))
+    cov[:, [0, 2], [0, 2]], cov[:, [1, 3], [1, 3]], cov[:, 4, 4], cov[:, 5, 5] = 900.0, 100.0**2, 1e6, 225.0
+    settings = TrackerSettings(plot_outlier=0.0, degraded_noise=1.0)
+    kinematics, life = make_kinematics(AGILE), Lifecycle(settings)
+    rows = kinematics.add(Start(mean, cov))
+    life.begin(rows, Birth(np.zeros(n), np.full(n, DT), np.zeros(n, int), mean, cov))
+    m = measured(rng.uniform(3.5, 4.5, n), rng.uniform(-15e3, 15e3, (n, 2)), 30.0)
+    gate = Gate(settings, AGILE, np.array([4.0]), use_identity=False)
+    source = SourceCondition(plot_law(settings, Kind.PLANE), settings)
+    near = gate._near(life, m, np.arange(n), source, source.predicted(0.0))
+    found = gate(kinematics, life, m, np.arange(n), source, source.predicted(0.0))
+    track, plot = np.repeat(rows, n), np.tile(np.arange(n), n)
+    ahead = predict(kinematics, life, m, track, plot, np.zeros((n * n, 3, 3)))
+    d2, _ = distances(ahead.nu, ahead.S)
+    inside = set(zip(track[d2 <= gate.horizontal].tolist(), plot[d2 <= gate.horizontal].tolist(), strict=True))
+    assert len(inside) > 300
+    assert set(zip(found.pairs.track.tolist(), found.pairs.plot.tolist(), strict=True)) == inside
+    assert len(near.track) < 1.01 * len(inside) + 3

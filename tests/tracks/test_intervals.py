@@ -35,3 +35,10 @@ def test_it_forgets_rather_than_grows(rng):
         dt = rng.uniform(0.0, 10.0, 100)  # no two alike
         assert_right(table.at(dt), dt)
     assert len(table) <= 4196
+
+
+def test_more_at_once_than_is_worth_remembering(rng):
+    table = Intervals([(MOTION, [CHAIN, ONLY]), (STILL, [ONLY])])
+    dt = rng.uniform(0.0, 10.0, 5000)
+    assert_right(table.at(dt), dt)
+    assert len(table) == 1

@@ -215,8 +215,27 @@ class Gate:
         variance = bounds.spread(m, plot) + m.jitter[plot] ** 2 * np.square(velocity).sum(axis=1)
         reach = self._reach(life, track, np.abs(dt), variance)
         reach = reach + np.where(life.status[track] == CONFIRMED, self._astray(m, plot, bounds), 0.0)
-        keep = np.linalg.norm(m.position[plot, :2] - position, axis=-1) <= reach
+        nu = m.position[plot, :2] - position
+        keep = np.linalg.norm(nu, axis=-1) <= reach
+        seeds = np.flatnonzero(keep & (life.status[track] == SEED))
+        keep[seeds] = self._within(nu[seeds], life.cov[track[seeds]], bounds.growth * m.cov[plot[seeds]], dt[seeds])
         return Pairs(track[keep], pairs.plot[keep])
+
+    def _within(self, nu: _Array, P: _Array, R: _Array, dt: _Array) -> npt.NDArray[np.bool_]:
+        """Say which innovations (k, 2) lie inside the gate of a track at rest, which no mode but the hardest widens.
+
+        A track of one plot has the widest gate of all; among dense targets most of what its radius holds is outside.
+        """
+        S = np.zeros((len(nu), 3, 3))
+        t = dt[:, None, None]
+        pp, pv, vv = P[:, 0:3:2, 0:3:2], P[:, 0:3:2, 1:4:2], P[:, 1:4:2, 1:4:2]
+        hardest = self._accel**2 * dt**3 * (0.25 * dt + self._accel_time / 3.0)
+        S[:, :2, :2] = (
+            pp + t * (pv + pv.swapaxes(1, 2)) + t * t * vv + R[:, :2, :2] + hardest[:, None, None] * np.eye(2)
+        )
+        S[:, 2, 2] = 1.0
+        d2, _ = distances(np.column_stack([nu, np.zeros(len(nu))]), S)
+        return np.asarray(d2 <= self.horizontal * (1.0 + 1e-9))
 
     def _reach(self, life: Lifecycle, rows: _Index, dt: _Array, plot_variance: float | _Array) -> _Array:
         """Radius of the gate after dt, from the last state and the hardest manoeuvre since."""

@@ -41,6 +41,11 @@ class Intervals:
     def at(self, dt: _Array) -> tuple[Matrices, ...]:
         """Return the matrices over intervals dt (k,), s, of each part."""
         place = self._places(dt)
+        if (place < 0).sum() > _MOST:  # more than is worth remembering
+            return tuple(
+                Matrices(*motion.step(dt)[:2], [None if len(c) == 1 else c.transition(dt) for c in chains])
+                for motion, chains in self._parts
+            )
         if (place < 0).any():
             if len(self._known) > _MOST:
                 self._known, self._row = self._known[:0], self._row[:0]
