@@ -116,3 +116,20 @@ def test_a_scene_across_180_degrees_is_the_scene_elsewhere(tmp_path, rng):
     moved = (np.array(across["longitude"]) - 170.0 + 180.0) % 360.0 - 180.0
     np.testing.assert_allclose(moved, np.array(elsewhere["longitude"]), atol=1e-7)
     np.testing.assert_allclose(np.array(across["latitude"]), np.array(elsewhere["latitude"]), atol=1e-7)
+
+
+def test_tables_without_noise_make_their_tracks_and_are_told(tmp_path):
+    """Two sources without noise, and the way of a second between them: what a newcomer simulates first."""
+    for name, late in (("a", 0.0), ("b", 1.0)):
+        rows = [
+            f"{START + 4.0 * k + late},{41 + 0.002 * k + 0.1 * j},{2 + 0.003 * k},3000,{0x400000 + j:06x}"
+            for j in range(3)
+            for k in range(60)
+        ]
+        (tmp_path / f"{name}.csv").write_text("time,latitude,longitude,altitude_m,icao24\n" + "\n".join(rows) + "\n")
+    both = track_files([tmp_path / "a.csv", tmp_path / "b.csv"], tmp_path / "both", report=False)
+    assert both["tracks"]["confirmed"] == 3
+    assert any("a: its reports scatter by less than 0.01 m" in line for line in both["problems"])
+    alone = track_files([tmp_path / "a.csv"], tmp_path / "alone", report=False)
+    assert alone["tracks"]["confirmed"] == 3
+    assert alone["noise"]["a"]["sigma_xy_m"]["used"] == 0.01

@@ -15,7 +15,7 @@ from saltus.records import Kind, Plots
 from saltus.text import say, shown
 from saltus.tracks.health import Health, nis_interval, sensor_health
 from saltus.tracks.measurements import Measurements, Noise
-from saltus.tracks.noise import NoiseEstimate
+from saltus.tracks.noise import LEAST, NoiseEstimate
 from saltus.tracks.rows import Assignments, Rows, join_rows
 from saltus.tracks.settings import TrackerSettings
 
@@ -232,22 +232,41 @@ def noise_rows(summary: dict[str, Any]) -> dict[str, object]:
 
 def _doubts(noise: dict[str, Any], *, several: bool) -> list[str]:
     """Say of which sources the innovations contradict the noise used."""
-    return [
-        f"{name}: NIS {row['nis_mean']} where 2 is expected: the errors are larger than the noise used explains "
-        "(a bias between sources, or errors that last). Covariances of its tracks are too small; set its sigma or "
-        "correlation_time in the configuration."
-        for name, row in noise.items()
-        if row["nis_mean"] is not None and row["nis_mean"] > _DOUBTFUL_NIS and _telling(row)
-    ] + [
-        f"{name}: {why}; is a unit wrong (NM for m, radians for degrees), or sigma in the configuration?"
-        for name, row in noise.items()
-        for why in _implausible(row, several=several)
-    ]
+    return (
+        [
+            f"{name}: NIS {row['nis_mean']} where 2 is expected: the errors are larger than the noise used explains "
+            "(a bias between sources, or errors that last). Covariances of its tracks are too small; set its sigma or "
+            "correlation_time in the configuration."
+            for name, row in noise.items()
+            if row["nis_mean"] is not None and row["nis_mean"] > _DOUBTFUL_NIS and _telling(row)
+        ]
+        + [
+            f"{name}: {why}; is a unit wrong (NM for m, radians for degrees), or sigma in the configuration?"
+            for name, row in noise.items()
+            for why in (() if _noise_free(row) else _implausible(row, several=several))
+        ]
+        + [
+            f"{name}: its reports scatter by less than {LEAST} m, as no sensor's do: they carry no noise. "
+            f"{label} {row[label]['used']} is used; set it in the configuration."
+            for name, row in noise.items()
+            for label in _noise_free(row)
+        ]
+    )
 
 
 def _telling(row: dict[str, Any]) -> bool:
     """Say whether the mean NIS is further from 2 than four of its standard errors, 2 / sqrt(n)."""
     return bool(abs(row["nis_mean"] - 2.0) * np.sqrt(row["nis_updates"]) > 4.0 * 2.0)
+
+
+def _noise_free(row: dict[str, Any]) -> list[str]:
+    """Which deviations of a source, not configured, are too small to be a sensor's."""
+    return [
+        label
+        for label in row
+        if label.startswith("sigma") and label.endswith("_m") and row[label]["configured"] is None
+        if row[label]["estimated"] is not None and row[label]["estimated"] < LEAST
+    ]
 
 
 def _implausible(row: dict[str, Any], *, several: bool) -> list[str]:

@@ -64,15 +64,25 @@ def track_system(
     if any(not _configured(plots, s, sensors.configured[s]) for s in sources if s in used):
         stretch = _first_stretch(plots)
         well = replace(config.tracker, degraded_noise=1.0)  # larger errors are the noise sought, no condition
-        *_, estimates = run(stretch, "estimating noise", well)
+        _, m, first, estimates = run(stretch, "estimating noise", well)
+        before, begun = _tracked(m, first, len(plots.sources)), dict(noise)
         for s in sources:
             estimated = apply_estimate(noise[s], estimates[s], plots.sources[s])
             noise[s] = replace(estimated, **sensors.configured[s])
-        rows, m, *_ = run(stretch, "checking noise", well)
+        rows, m, again, _ = run(stretch, "checking noise", well)
+        after = _tracked(m, again, len(plots.sources))
         for s in sources:
+            if 2 * after[s] < before[s]:  # with its estimate it loses its tracks: they scatter less than they differ
+                noise[s] = begun[s]
+                continue
             noise[s] = replace(widened(noise[s], _steady_d2(rows, m, s)), **sensors.configured[s])
     rows, m, found, estimates = run(plots, "tracking", config.tracker)
     return Tracked(rows, m, found, plane, noise, estimates)
+
+
+def _tracked(m: Measurements, found: Assignments, n: int) -> npt.NDArray[np.int64]:
+    """Count the measurements of each source on confirmed tracks, (n,)."""
+    return np.bincount(m.source[np.isin(found.track_id, found.confirmed)], minlength=n)
 
 
 def _places(m: Measurements, plots: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -9,9 +9,11 @@ import numpy.typing as npt
 from saltus.records import Source
 from saltus.tracks.measurements import Measurements, Noise
 
-__all__ = ["NoiseEstimate", "apply_estimate", "estimate_noise", "widened"]
+__all__ = ["LEAST", "NoiseEstimate", "apply_estimate", "estimate_noise", "widened"]
 
 _Array = npt.NDArray[np.float64]
+
+LEAST, _AT = 0.01, 5e3  # m, and m of range: what an aircraft flies while no clock of a sensor tells the time better
 
 _WINDOW = 7  # plots of one track
 _STEP = 2.0  # s, some, between those of a position: in less, what an aircraft's position errs by looks like a turn
@@ -147,16 +149,16 @@ def _trimmed(e: _Array) -> float:
 
 
 def apply_estimate(noise: Noise, estimate: NoiseEstimate, source: Source) -> Noise:
-    """Replace what was estimated, never below quantisation, LSB / sqrt(12)."""
+    """Replace what was estimated, never below quantisation, LSB / sqrt(12), nor below `LEAST`."""
     step = np.sqrt(12.0)
 
-    def at_least(value: float, lsb: float, otherwise: float) -> float:
-        return max(value, lsb / step) if np.isfinite(value) and value > 0 else otherwise
+    def at_least(value: float, lsb: float, otherwise: float, least: float = LEAST) -> float:
+        return max(value, lsb / step, least) if np.isfinite(value) and value > 0 else otherwise
 
     return replace(
         noise,
         range=at_least(estimate.range, source.range_lsb, noise.range),
-        azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth),
+        azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth, LEAST / _AT),
         elevation=at_least(estimate.elevation, source.elevation_lsb, noise.elevation),
         xy=at_least(estimate.xy, source.xy_lsb, noise.xy),
         time=estimate.time if np.isfinite(estimate.time) else noise.time,
