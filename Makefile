@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 NATIVE := CMakeLists.txt $(wildcard native/*)
 DOCS_READY := $(VENV)/.docs-ready
 
-.PHONY: demo test crash check format docs wheel bench bench-asterix sanitize fuzz clean
+.PHONY: demo test crash check format docs wheel bench bench-asterix sanitize fuzz clean soak
 
 demo: $(READY)
 	$(BIN)/saltus demo -o out/demo
@@ -18,6 +18,10 @@ test: $(READY)
 crash: $(READY)
 	$(BIN)/python tests/crashing.py --kills 200
 	$(BIN)/python tests/crashing.py --kills 200 --way in-place
+
+# Simulated hours through the program: memory and time per report against length.
+soak: $(READY)
+	$(BIN)/python benchmarks/soak.py
 
 check: $(READY)
 	$(BIN)/ruff format --check .
