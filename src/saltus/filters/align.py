@@ -139,7 +139,7 @@ def align(
     if cov0.ndim < 2:
         raise ModelError(f"cov0 has shape {cov0.shape}; it is a covariance matrix, (n, n), per mode or per run.")
     n = cov0.shape[-1]
-    matrices = [array(f"trans[{c}]", t) for c, t in enumerate(trans)]
+    matrices = transitions(trans)
     for c, t in enumerate(matrices):
         if t.ndim < 2 or t.shape[-1] != t.shape[-2] or t.shape[-1] == 0:
             raise ModelError(f"trans[{c}] has shape {t.shape}; a transition matrix is square, (M, M).")
@@ -173,6 +173,17 @@ def _measurements(z: npt.ArrayLike, defer: bool) -> tuple[_Array, npt.NDArray[np
     return np.where(seen, z_in, 0.0), seen
 
 
+def transitions(trans: Sequence[npt.ArrayLike]) -> list[_Array]:
+    """Read one matrix per chain.
+
+    Raises:
+        ModelError: it is no sequence, or holds what is no array of numbers.
+    """
+    if not isinstance(trans, Sequence | np.ndarray) or isinstance(trans, str):
+        raise ModelError(f"trans is one transition matrix per chain, [matrix, ...], got {trans!r}; [] is no chain.")
+    return [array(f"trans[{c}]", t) for c, t in enumerate(trans)]
+
+
 def array(name: str, value: npt.ArrayLike) -> _Array:
     """Read an array of numbers.
 
@@ -180,6 +191,8 @@ def array(name: str, value: npt.ArrayLike) -> _Array:
         ModelError: it is ragged, or not of numbers.
     """
     try:
+        if np.iscomplexobj(value):
+            raise TypeError("it is complex")
         return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
         shapes = dict.fromkeys(str(np.shape(v)) for v in _elements(value))

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.filters import steps
-from saltus.filters.align import Aligned, align
+from saltus.filters.align import Aligned, align, array, transitions
 from saltus.filters.backend import Backend, check_settings, fits_kernel, use_native
 from saltus.filters.estimates import Estimates, allocate
 from saltus.filters.refusals import check_finite
@@ -73,6 +73,7 @@ def imm_filter(
     Source: Detkov (2023), equations 3.1-3.15 as corrected in the fusion notes; Blom and Bar-Shalom (1988).
     """
     check_settings(keep, num_threads)
+    z, cov0, trans = array("z", z), array("cov0", cov0), transitions(trans)
 
     def aligned(defer: bool) -> Aligned:
         return align(z, F=F, Q=Q, H=H, R=R, trans=trans, mean0=mean0, cov0=cov0, probs0=probs0, b=b, d=d, defer=defer)
@@ -81,7 +82,7 @@ def imm_filter(
         from saltus.filters.native import Run, filter_native
 
         run = Run(per_mode=per_mode, every=keep == "all", num_threads=num_threads)
-        return filter_native(np.asarray(z, dtype=np.float64), aligned, run)
+        return filter_native(z, aligned, run)
     return filter_aligned(aligned(False), per_mode=per_mode, every=keep == "all")
 
 

@@ -165,9 +165,12 @@ def in_order(
     """List records with their times.
 
     Raises:
-        DataError: there is no record, or time goes back.
+        DataError: there is no record, one is none, or time goes back.
     """
-    listed = [Record(*record) for record in records]
+    try:
+        listed = [_read(Record(*record), k) for k, record in enumerate(records)]
+    except TypeError as error:
+        raise DataError(f"records are (time, sensor, values) each, with an observer or without: {error}.") from None
     if not listed:
         raise DataError("there is no record to filter.")
     times = np.array([record.time for record in listed], dtype=np.float64)
@@ -176,6 +179,28 @@ def in_order(
         k = int(back[0]) + 1
         raise DataError(f"record {k} at {times[k]} s is older than record {k - 1} at {times[k - 1]} s; sort by time.")
     return listed, times
+
+
+def _read(record: Record, k: int) -> Record:
+    """A record with its numbers read.
+
+    Raises:
+        DataError: its time is no number, its sensor no name, or its values are no array of numbers.
+    """
+    if not isinstance(record.sensor, str):
+        raise DataError(f"record {k}: the sensor is given by its name, got {record.sensor!r}.")
+    if record.observer is not None and not isinstance(record.observer, Observer):
+        raise DataError(f"record {k}: the observer must be an Observer, got {record.observer!r}.")
+    try:
+        time, z = np.asarray(record.time), np.asarray(record.z)
+        if time.ndim or time.dtype.kind not in "biuf" or z.dtype.kind not in "biufO":
+            raise TypeError("not real numbers")
+        return record._replace(time=float(time), z=z.astype(np.float64))
+    except (TypeError, ValueError) as error:
+        raise DataError(
+            f"record {k}: a time in seconds and an array of numbers, NaN for what is missing, not {record.time!r} and "
+            f"{record.z!r} ({error})."
+        ) from None
 
 
 def _propagated(belief: steps.Belief, arrays: Arrays, k: int) -> steps.Belief:

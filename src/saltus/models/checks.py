@@ -112,7 +112,7 @@ def probability(value: float, what: str) -> None:
     Raises:
         ModelError: the value does not lie in (0, 1].
     """
-    if not 0 < value <= 1:
+    if not isinstance(value, int | float | np.integer | np.floating) or not 0 < value <= 1:
         raise ModelError(f"{what} must lie in (0, 1], got {value!r}.")
 
 

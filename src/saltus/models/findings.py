@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from saltus.errors import ModelError
 from saltus.models.arrays import Arrays
-from saltus.models.checks import FloatArray, equal_intervals
+from saltus.models.checks import FloatArray, equal_intervals, numbers
 from saltus.models.coloured import ColouredSensor
 from saltus.models.dependence import TimeDependent, fixed
 from saltus.models.dynamics import LinearSDE, LinearTransition
@@ -65,7 +65,7 @@ def per_interval(model: HybridModel, times: npt.ArrayLike | None = None) -> list
         model: any model.
         times: of the measurements, s; with equal intervals nothing is said. None says it in any case.
     """
-    steps = np.ones(1) if times is None else np.diff(np.asarray(times, dtype=np.float64))
+    steps = np.ones(1) if times is None else np.diff(numbers(times, "times").reshape(-1))
     steps = steps[steps > 0]
     if (times is not None and equal_intervals(steps)) or _asks_for_t(model.dynamics):
         return []

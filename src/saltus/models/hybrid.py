@@ -1,6 +1,6 @@
 """A whole model: chains, motion, sensors and prior, and the arrays a filter takes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import prod
 from typing import TYPE_CHECKING
@@ -52,7 +52,9 @@ class HybridModel:
 
     def __post_init__(self) -> None:
         put = object.__setattr__
-        chains = tuple(self.chains)
+        chains = tuple(self.chains) if isinstance(self.chains, Iterable) else (self.chains,)
+        if not all(isinstance(chain, Chain) for chain in chains):
+            raise ModelError(f"chains is a list of Chain, [] for none; got {self.chains!r}.")
         names = [chain.name for chain in chains]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -63,7 +65,7 @@ class HybridModel:
                 f"the chains have {sizes} joint states: at most {_MOST_CHAINS} chains and {_MOST_MODES} joint states "
                 "can be computed. Leave chains out, or join those that always jump together."
             )
-        if not self.sensors:
+        if not isinstance(self.sensors, Mapping) or not self.sensors:
             raise ModelError("a model needs at least one sensor: sensors={'radar': PositionSensor(...)}.")
         put(self, "chains", chains)
         put(self, "dynamics", self.dynamics.bind(chains))
@@ -234,6 +236,8 @@ def _bind_sensor(name: str, sensor: Sensor, chains: Sequence[Chain], n_state: in
 
 
 def _names(sensor: str | Sequence[str] | None, known: list[str]) -> list[str]:
+    if sensor is not None and not isinstance(sensor, Iterable):
+        raise ModelError(f"sensor is a name, several, or None for all; got {sensor!r}.")
     names = known if sensor is None else [sensor] if isinstance(sensor, str) else list(sensor)
     for name in names:
         if name not in known:
