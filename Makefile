@@ -15,9 +15,10 @@ test: $(READY)
 	$(BIN)/python -m pytest -n auto
 
 # Kill runs of the tracker at every call of the file system and at random moments.
+KILLS ?= 200
 crash: $(READY)
-	$(BIN)/python tests/crashing.py --kills 200
-	$(BIN)/python tests/crashing.py --kills 200 --way in-place
+	$(BIN)/python tests/crashing.py --kills $(KILLS)
+	$(BIN)/python tests/crashing.py --kills $(KILLS) --way in-place
 
 # Simulated hours through the program: memory and time per report against length.
 soak: $(READY)

@@ -244,9 +244,9 @@ def test_garbage(tmp_path):
 
 
 def test_an_unknown_format_lists_the_known_ones(tmp_path):
-    (tmp_path / "tracks.xlsx").write_bytes(b"PK\x03\x04" + bytes(100))
-    line = refused("track", tmp_path / "tracks.xlsx", "-o", tmp_path / "out")
-    for known in ("tracks.xlsx", ".ast", ".pcap", ".csv", ".parquet"):
+    (tmp_path / "tracks.dat").write_bytes(b"\xff\x00\x01\x02" + bytes(100))
+    line = refused("track", tmp_path / "tracks.dat", "-o", tmp_path / "out")
+    for known in ("tracks.dat", ".ast", ".pcap", ".csv", ".parquet"):
         assert known in line
 
 
