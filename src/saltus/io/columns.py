@@ -83,6 +83,8 @@ class Columns:
         item's first part, is there.
         """
         column = self._held.get(path)
+        if column is not None and column.values.dtype.kind not in "biu":
+            column = None  # this edition has a text there
         values = np.full(self.n, -1, np.int64) if column is None else column.values
         if beside is None or column is None:
             return values
