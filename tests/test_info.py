@@ -6,7 +6,7 @@ from click.testing import CliRunner
 
 from saltus.cli import main
 from saltus.config import load_config
-from saltus.info.figures import extents, levels, targets
+from saltus.info.figures import Figures
 from saltus.io.asterix_write import write_cat048
 from saltus.records import Kind, Plots
 
@@ -184,10 +184,32 @@ def plots(**columns):
     return Plots.build(n, (), (), columns)
 
 
+def targets(*some):
+    figures = Figures()
+    for each in some:
+        figures.add(each)
+    return figures.targets()
+
+
+def extents(*some):
+    figures = Figures()
+    for each in some:
+        figures.add(each)
+    return figures.extents()
+
+
+def levels(*some):
+    figures = Figures()
+    for each in some:
+        figures.add(each)
+    return figures.levels()
+
+
 def test_targets_by_what_tells_them_apart_best():
     assert targets(plots(icao24=[1, 2, 2, -1, -1], mode3a=[7, 7, 7, 8, -1])) == (
         "2 by Mode S address, 1 by Mode 3/A code of those without; 1 reports without identity"
     )
+    assert targets(plots(icao24=[1, 2]), plots(icao24=[2, 3])) == "3 by Mode S address"
     assert targets(plots(local_id=[5, 6, 6])) == "2 by the system's own track numbers"
     assert targets(plots(time=[1.0, 2.0])) == "cannot be told: no report carries an identity"
 
@@ -210,8 +232,8 @@ def test_extents_across_north_and_across_the_date_line():
 
 
 def test_levels():
-    feet = np.array([0.0, 10000.0, 20000.0, np.nan])
-    assert levels(plots(altitude=feet * 0.3048, on_ground=[1, 0, 0, 0])) == (
-        "FL 0 to 200, half of them FL 50 to 150; 75% tell one; 25% on the ground"
-    )
+    feet = np.array([0.0, 5000.0, 10000.0, 15000.0, np.nan])
+    some = plots(altitude=feet * 0.3048, on_ground=[1, 0, 0, 0, 0])
+    assert levels(some) == "FL 0 to 150, half of them FL 0 to 100; 80% tell one; 20% on the ground"
+    assert levels(some, some) == levels(some)
     assert levels(plots(time=[1.0])) == ""

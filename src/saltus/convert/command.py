@@ -19,9 +19,10 @@ from saltus.errors import DataError
 from saltus.io import format_of
 from saltus.io.blocks import Blocks
 from saltus.io.columns import SOURCE
+from saltus.io.dating import Clock, Read, read_records
 from saltus.io.found import Found
 from saltus.io.inputs import expand
-from saltus.io.stream import Clock, Stream
+from saltus.io.stream import Stream
 from saltus.io.write import output_file
 from saltus.progress import Progress, progress_bar
 from saltus.times import time_window
@@ -118,8 +119,8 @@ def _first_pass(path: Path, config: Config, categories: Sequence[int], items: It
     for piece in stream.pieces(progress=lambda name, share: bar.working(f"looking at {name}", share)):
         found = stream.records(piece)
         dated = all(blocks.dated for blocks, _ in piece.values())
-        for number, times in clock.times(found, dated=dated).items():
-            if not len(times) or (categories and number not in categories):
+        for number, times in clock.times(_read(found), dated=dated).items():
+            if categories and number not in categories:
                 continue
             seen = held.setdefault(number, set())
             seen |= held_by(found[number], [f for f in fields_of(found[number].layout, items) if f.path not in seen])
@@ -129,6 +130,10 @@ def _first_pass(path: Path, config: Config, categories: Sequence[int], items: It
     editions = {number: chosen.edition for number, chosen in stream.chosen.items() if chosen.edition}
     unread = [f"{path.name}: category {n}: {c.note}" for n, c in stream.chosen.items() if not c.edition]
     return _Met(path, editions, held, first, last, (*stream.told.problems, *unread, *dict.fromkeys(clock.problems)))
+
+
+def _read(found: Mapping[int, Found]) -> dict[int, Read]:
+    return {number: read_records(number, f) for number, f in found.items() if len(f)}
 
 
 def _layouts(met: Sequence[_Met]) -> dict[int, Layout]:
@@ -181,10 +186,10 @@ def _tables(
     stream = Stream(m.path, m.editions, config.framing)
     clock, before = Clock(config.date, m.path.name), Counter[int]()
     for piece in stream.pieces(progress=lambda name, share: bar.working(f"converting {name}", share)):
-        found = {number: f for number, f in stream.records(piece).items()}
-        times = clock.times(found, dated=all(blocks.dated for blocks, _ in piece.values()))
+        found = stream.records(piece)
+        times = clock.times(_read(found), dated=all(blocks.dated for blocks, _ in piece.values()))
         parts, sequence, counts = [], [], Counter[int]()
-        for number in sorted(found.keys() & columns.keys()):
+        for number in sorted(times.keys() & columns.keys()):
             f = found[number]
             part = _common(m.path.name, number, f, piece[number][0], times[number], before[number])
             part |= table_of(number, f, [c for c in columns[number] if f.layout.has(c.path)], native=native)

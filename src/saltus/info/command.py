@@ -8,7 +8,6 @@ from pathlib import Path
 
 import click
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console, Group, RenderableType
 from rich.padding import Padding
 from rich.table import Table
@@ -16,13 +15,14 @@ from rich.text import Text
 
 from saltus.config import Config, load_config
 from saltus.errors import DataError, SaltusError
-from saltus.info.figures import extents, levels, targets
+from saltus.info.inventory import Inventory, Line
 from saltus.info.skeleton import skeleton
-from saltus.io import Told, read_part
+from saltus.io import Told, format_of, read_part
+from saltus.io.asterix import read_pieces
 from saltus.io.inputs import expand
 from saltus.io.merge import merge
-from saltus.io.part import Part
-from saltus.records import Contents, FileContents, Plots, Recording
+from saltus.io.part import Part, printable
+from saltus.records import Contents, FileContents
 from saltus.text import shown
 
 __all__ = ["show_info"]
@@ -61,52 +61,52 @@ def show_info(
     """
     config = load_config(config_path, date=date, framing=framing)
     told = Told(config.date, config.editions, config.framing, config.reading, None if full else _HEAD)
-    parts: list[Part] = []
+    inventory, parts = Inventory(), list[Part]()
     failures: dict[str, SaltusError | OSError] = {}
-    for path in expand(inputs):
+    paths = expand(inputs)
+    for path in paths:
         try:
-            parts.append(read_part(path, told))
+            if full and path.stat().st_size > _HEAD and "table" not in format_of(path, config.framing).name:
+                for part in read_pieces(path, date=told.date, editions=told.editions, framing=told.framing):
+                    inventory.add(merge([printable(part)]))
+            else:
+                parts.append(read_part(path, told))
         except (SaltusError, OSError) as error:
             failures.setdefault(str(error), error)
-    if parts and as_skeleton:
-        click.echo(skeleton(merge(parts)), nl=False)
-    elif parts:
+    if parts:
+        inventory.add(merge(parts))
+    if inventory.lines and as_skeleton:
+        click.echo(skeleton(inventory), nl=False)
+    elif inventory.lines:
         console = Console(highlight=False)
         if not console.is_terminal:
             console = Console(highlight=False, width=_PLAIN_WIDTH)
-        _show(console, merge(parts), config)
+        _show(console, inventory, [shown(path.name) for path in paths], config)
     if len(failures) == 1:
         raise next(iter(failures.values()))
     if failures:
         raise DataError("\n".join(failures))
 
 
-def _show(console: Console, recording: Recording, config: Config) -> None:
-    plots = recording.plots
-    about = {f.file: f for f in recording.files}
-    names = {name: k for k, name in enumerate(plots.files)}
-    for file, lines in groupby(recording.contents, key=lambda c: c.file):
+def _show(console: Console, inventory: Inventory, files: Sequence[str], config: Config) -> None:
+    """Print all files in the order in which they were given."""
+    for file in dict.fromkeys(files):
+        lines = inventory.of_file(file)
+        if not lines:
+            continue
         console.print(Text(file, style="bold"))
-        if file in about:
-            console.print(Padding(_file(about[file]), (0, 0, 1, 2)))
-        some = list(lines)
-        for line in some:
-            mine = plots.take(_of(plots, line, names.get(file, -1)))
-            console.print(Padding(_system(line, mine, config), (0, 0, 1, 2)))
-        for items in _items(some):
+        if file in inventory.files:
+            console.print(Padding(_file(inventory.files[file]), (0, 0, 1, 2)))
+        for line in lines:
+            console.print(Padding(_system(line, config), (0, 0, 1, 2)))
+        for items in _items([line.contents for line in lines]):
             console.print(Padding(items, (0, 0, 1, 2)))
-    usable = int(np.count_nonzero(plots.reason == 0))
-    console.print(f"{len(plots)} target reports, {usable} usable, {len(plots) - usable} rejected")
-    if recording.tracks is not None:
-        console.print(f"{recording.tracks.num_rows} reports are another system's tracks: kept apart, never plots")
-    for problem in recording.problems:
+    n, usable = inventory.n_reports, inventory.n_usable
+    console.print(f"{n} target reports, {usable} usable, {n - usable} rejected")
+    if inventory.n_tracks:
+        console.print(f"{inventory.n_tracks} reports are another system's tracks: kept apart, never plots")
+    for problem in inventory.problems:
         console.print(Text("problem: ", style="yellow") + Text(problem))
-
-
-def _of(plots: Plots, line: Contents, file: int) -> npt.NDArray[np.bool_]:
-    own = [k for k, s in enumerate(plots.sources) if s.system == line.system]
-    mine: npt.NDArray[np.bool_] = (plots.file == file) & np.isin(plots.source, own)
-    return mine
 
 
 def _grid() -> Table:
@@ -132,9 +132,9 @@ def _file(file: FileContents) -> Table:
     return grid
 
 
-def _system(line: Contents, plots: Plots, config: Config) -> Table:
+def _system(entry: Line, config: Config) -> Table:
     """One system as a grid of two columns."""
-    grid = _grid()
+    grid, line, figures = _grid(), entry.contents, entry.figures
     site = config.site_for(line.system)
     named = f"  {shown(site.name)}" if site and shown(site.name) != line.system.name else ""
     edition = f"  edition {line.edition}" if line.edition else ""
@@ -142,15 +142,15 @@ def _system(line: Contents, plots: Plots, config: Config) -> Table:
     grid.add_row(Text(str(line.system), style="bold"), Text(f"{named}{edition}{words}".strip()))
     grid.add_row("records", f"{line.n_records}, of these {line.n_reports} target reports")
     if line.n_reports:
-        grid.add_row("targets", Text(targets(plots)))
+        grid.add_row("targets", Text(figures.targets()))
     grid.add_row("time", _span(line))
     period = "cannot be told" if np.isnan(line.update_period) else f"{line.update_period:.3f} s"
     grid.add_row("update", period)
-    for where in extents(plots):
+    for where in figures.extents():
         grid.add_row("extent", Text(where))
     if line.site is not None:
         grid.add_row("site", Text(_place(*line.site)))
-    high = levels(plots)
+    high = figures.levels()
     if high:
         grid.add_row("levels", Text(high))
     if line.n_by_type:

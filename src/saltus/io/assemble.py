@@ -1,9 +1,8 @@
 """Records of a recording, as columns, to target reports and lines of contents."""
 
-import datetime
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,40 +10,39 @@ import pyarrow as pa
 
 from saltus.asterix.codec import announced
 from saltus.io.categories import CATEGORIES
-from saltus.io.clock import DAY, complete, day_offsets, impossible, told_clock
-from saltus.io.columns import SOURCE, Decoded
+from saltus.io.clock import told_clock
+from saltus.io.columns import Decoded
+from saltus.io.dating import Clock, Read, read_records
 from saltus.io.found import Found
 from saltus.io.part import Part, revisit, rotating
-from saltus.records import REASONS, Contents, Kind, Plots, Source, System, Traits
+from saltus.records import Contents, Kind, Plots, Source, System, Traits
 
-__all__ = ["Found", "Read", "assemble", "read_records", "time_of_day"]
-
-
-@dataclass(frozen=True, slots=True)
-class Read:
-    """What became of the records of one category."""
-
-    found: Found
-    decoded: Decoded
-    systems: list[System]
-    system_of: npt.NDArray[np.int64]  # of each record
+__all__ = ["assemble"]
 
 
 def assemble(
     name: str,
     found: Mapping[int, Found],
     notes: Mapping[int, tuple[str, ...]],
-    problems: list[str],
-    date: datetime.date | str | None,
+    clock: Clock,
+    *,
+    dated: bool,
 ) -> Part:
-    """Turn records into target reports and lines of contents."""
+    """Turn the records of a recording, or of its next piece, into target reports and lines of contents.
+
+    Args:
+        name: of the file.
+        found: records by category.
+        notes: on each category.
+        clock: that goes on from piece to piece.
+        dated: the clocks of all blocks tell the date.
+    """
     read = {number: read_records(number, records) for number, records in found.items() if len(records)}
-    times = _times(read, date, name, problems)
-    if isinstance(date, str) and read:
+    problems: list[str] = []
+    times = clock.times(read, dated=dated)
+    if clock.captured(dated=dated):
         told = told_clock(*(np.concatenate(c) for c in ([r.found.clock for r in read.values()], list(times.values()))))
         problems += [f"{name}: {told}"] if told else []
-    if date is None:
-        problems.append(f"{name}: no date given: times count from 1970-01-01; give --date YYYY-MM-DD.")
     plots, tracks, contents = [], [], []
     turns = _turns(read, times)
     for number, r in read.items():
@@ -70,83 +68,8 @@ def assemble(
         tuple(contents),
         tuple(problems),
         in_order=True,
-        dated=isinstance(date, str),
+        dated=clock.captured(dated=dated),
     )
-
-
-def read_records(number: int, found: Found) -> Read:
-    """What becomes of the records of a category."""
-    first, stop = found.columns.spans(SOURCE).T
-    octets = found.data
-    word = octets[first].astype(np.int64) << 8 | octets[np.minimum(first + 1, stop - 1)]
-    values, which = np.unique(word, return_inverse=True)
-    systems = [System(number, int(v) >> 8, int(v) & 255) for v in values]
-    return Read(found, _possible(CATEGORIES[number].decode(found.columns)), systems, which.astype(np.int64))
-
-
-def _possible(decoded: Decoded) -> Decoded:
-    """Take away the times of day that are none, and give their reports the reason."""
-    wrong = impossible(decoded.time_of_day)
-    if not wrong.any():
-        return decoded
-    reason = np.asarray(decoded.columns.get("reason", np.zeros(len(wrong))), np.int8)
-    marked = np.where(wrong & (reason == 0), REASONS.index("impossible time of day"), reason)
-    columns = {**decoded.columns, "reason": marked}
-    return decoded._replace(time_of_day=np.where(wrong, np.nan, decoded.time_of_day), columns=columns)
-
-
-def _times(
-    read: Mapping[int, Read], date: datetime.date | str | None, name: str, problems: list[str]
-) -> dict[int, npt.NDArray[np.float64]]:
-    """Times of all records, s, UTC: midnights are counted over the whole file, or told by the capture clock."""
-    sequence = np.concatenate([r.found.sequence for r in read.values()])
-    tod = np.concatenate([time_of_day(number, read, name, problems) for number in read])
-    if isinstance(date, str):
-        clock = np.concatenate([r.found.clock for r in read.values()])
-        days = np.round((clock - tod) / DAY)
-        time = tod + DAY * np.where(np.isnan(days), np.nanmedian(days) if np.isfinite(days).any() else 0.0, days)
-    else:
-        order = np.argsort(sequence, kind="stable")
-        days = np.empty(len(tod))
-        days[order] = day_offsets(tod[order])
-        first = (date or datetime.date(1970, 1, 1)) - datetime.date(1970, 1, 1)
-        time = tod + DAY * (days + first.days)
-    bounds = np.cumsum([0] + [len(r.found) for r in read.values()])
-    return {n: time[a:b] for n, a, b in zip(read, bounds[:-1], bounds[1:], strict=True)}
-
-
-def time_of_day(number: int, read: Mapping[int, Read], name: str, problems: list[str]) -> npt.NDArray[np.float64]:
-    """Times of day of a category's records; truncated ones are completed, or become NaN, and a problem says so."""
-    r = read[number]
-    modulus = r.decoded.time_modulus
-    if not modulus:
-        return r.decoded.time_of_day
-    time = complete(r.decoded.time_of_day, modulus, _reference(number, read))
-    lost = np.count_nonzero(np.isnan(time) & ~np.isnan(r.decoded.time_of_day))
-    if lost:
-        problems.append(
-            f"{name}: {lost} records of category {number} tell their time modulo {modulus:g} s only, and neither a "
-            f"message of category {CATEGORIES[number].turns} of their source nor a capture clock completes it: they "
-            "have no time. Record the service messages too, or capture packets."
-        )
-    return time
-
-
-def _reference(number: int, read: Mapping[int, Read]) -> npt.NDArray[np.float64]:
-    """A time of day near each record: the last of its source's service messages, else the next, else its capture."""
-    r = read[number]
-    near = r.found.clock % DAY
-    service = read.get(CATEGORIES[number].turns or 0)
-    if service is None:
-        return near
-    for k, system in enumerate(r.systems):
-        said = [j for j, s in enumerate(service.systems) if (s.sac, s.sic) == (system.sac, system.sic)]
-        told = np.isin(service.system_of, said) & np.isfinite(service.decoded.time_of_day)
-        if told.any():
-            mine = r.system_of == k
-            last = np.searchsorted(service.found.sequence[told], r.found.sequence[mine]) - 1
-            near[mine] = service.decoded.time_of_day[told][np.maximum(last, 0)]
-    return near
 
 
 def _plots(name: str, traits: Traits, r: Read, time: npt.NDArray[np.float64]) -> Plots:

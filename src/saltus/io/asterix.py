@@ -9,7 +9,7 @@ cannot be told apart, so it counts as no record, and a problem names its byte.
 """
 
 import datetime
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -18,13 +18,14 @@ from saltus.errors import DataError
 from saltus.framing import Told
 from saltus.framing.told import framing_words
 from saltus.io.assemble import assemble
-from saltus.io.blocks import Blocks, read_blocks
-from saltus.io.editions import choose_edition
-from saltus.io.found import Found, find
+from saltus.io.blocks import Blocks
+from saltus.io.dating import Clock
+from saltus.io.found import Found
 from saltus.io.part import Part
+from saltus.io.stream import Stream
 from saltus.records import Contents, FileContents, Plots, System
 
-__all__ = ["read_asterix"]
+__all__ = ["read_asterix", "read_pieces"]
 
 _TOLD = 8  # problems of one kind told one by one
 
@@ -51,41 +52,104 @@ def read_asterix(
     Raises:
         DataError: the file is empty, holds no record, or an edition does not exist or is plainly not the file's.
     """
+    *some, last = read_pieces(
+        path, date=date, editions=editions, framing=framing, most=most, whole=True, progress=progress
+    )
+    if not some:
+        return last
+    (part,) = some
+    return part._replace(
+        contents=(*part.contents, *last.contents), problems=(*last.problems, *part.problems), file=last.file
+    )
+
+
+def read_pieces(
+    path: Path,
+    *,
+    date: datetime.date | None,
+    editions: Mapping[int, str],
+    framing: str | None = None,
+    most: int | None = None,
+    whole: bool = False,
+    progress: Callable[[str, float], None] | None = None,
+) -> Iterator[Part]:
+    """Read one recording as `read_asterix` does, a piece at a time: memory does not grow with it.
+
+    Args:
+        path: the file.
+        date: of the first record; None = by the capture clock, else 1970-01-01.
+        editions: category -> edition; categories not named are guessed where they occur first.
+        framing: one of `saltus.framing.NAMES`; None has it guessed.
+        most: bytes read, from the beginning; None = all.
+        whole: the file is one piece.
+        progress: called with the file's name and the fraction read.
+
+    Yields:
+        Pieces with records, and last a part without reports: what could not be read, and how the file is framed.
+    """
     name = path.name
-    blocks, told = read_blocks(path, framing, progress, most)
     if not path.stat().st_size:
         raise DataError(f"{path}: byte 0: the file is empty.")
-    problems = list(told.problems)
-    over = ", ".join(f"{n} of {what}" for what, n in told.passed.items())
-    if over:
-        problems.append(f"{name}: {sum(told.passed.values())} packets passed over, without ASTERIX: {over}.")
-    notes: dict[int, tuple[str, ...]] = {}
-    found: dict[int, Found] = {}
-    unread = []
-    broken: list[tuple[int, str]] = []
-    for number in np.unique(blocks.category).tolist():
-        place = np.flatnonzero(blocks.category == number)
-        mine = blocks.take(place)
-        edition, note, _ = choose_edition(number, mine, editions.get(number), name)
-        if edition:
-            notes[number] = (note,) if note else ()
-            found[number] = find(number, edition, mine, place)
-            broken += _told(name, mine, found[number])
-        else:
-            unread.append(_unread(name, number, note))
-            problems.append(f"{name}: byte {mine.at[0]}: category {number} is not read: {note}")
-    broken.sort()
-    problems += [text for _, text in broken[:_TOLD]]
-    if len(broken) > _TOLD:
-        problems.append(f"{name}: {len(broken) - _TOLD} more blocks do not follow their definition.")
-    about = _about(path, told, most)
-    if any(len(f) for f in found.values()):
-        part = assemble(name, found, notes, problems, date if date or not blocks.dated else "capture clock")
-        return part._replace(contents=(*part.contents, *unread), file=about)
-    if not unread:
+    stream, clock, broken = Stream(path, editions, framing), Clock(date, name), _Broken(name)
+    first: dict[int, int] = {}  # byte of the first block of each category
+    empty, dated = True, True
+    for piece in stream.pieces(whole=whole, most=most, progress=progress):
+        for number, (blocks, _) in piece.items():
+            first.setdefault(number, int(blocks.at[0]))
+        found = stream.records(piece)
+        for number, held in found.items():
+            broken.add(piece[number][0], held)
+        of_piece = all(blocks.dated for blocks, _ in piece.values())
+        dated &= of_piece
+        if any(len(f) for f in found.values()):
+            empty = False
+            notes = {n: (c.note,) if c.note else () for n, c in stream.chosen.items()}
+            yield assemble(name, found, notes, clock, dated=of_piece)
+    unread = {n: c.note for n, c in sorted(stream.chosen.items()) if not c.edition}
+    problems = _problems(name, stream, unread, first, broken)
+    if not empty and date is None and not dated:
+        problems.append(f"{name}: no date given: times count from 1970-01-01; give --date YYYY-MM-DD.")
+    if empty and not unread:
         said = f" {problems[0]}" if problems else ""
         raise DataError(f"{path}: no ASTERIX record could be read: wrong format, category or edition?{said}")
-    return Part(Plots.build(0, (), (name,), {}), None, tuple(unread), tuple(problems), True, blocks.dated, about)
+    lines = tuple(_unread(name, number, note) for number, note in unread.items())
+    problems += dict.fromkeys(clock.problems)
+    about = _about(path, stream.told, most)
+    yield Part(Plots.build(0, (), (name,), {}), None, lines, tuple(problems), True, dated, about)
+
+
+class _Broken:
+    """Blocks that do not follow their edition: the first in words, the others counted."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._first: list[tuple[int, str]] = []
+        self._n = 0
+
+    def add(self, blocks: Blocks, held: Found) -> None:
+        """Take note of the faults of some records."""
+        said = _told(self._name, blocks, held)
+        self._n += len(said)
+        self._first = sorted([*self._first, *said])[:_TOLD]
+
+    def texts(self) -> list[str]:
+        """The first faults, and how many more there are."""
+        more = self._n - len(self._first)
+        last = [f"{self._name}: {more} more blocks do not follow their definition."] if more else []
+        return [text for _, text in self._first] + last
+
+
+def _problems(
+    name: str, stream: Stream, unread: Mapping[int, str], first: Mapping[int, int], broken: _Broken
+) -> list[str]:
+    """What could not be read of a file, in the order in which it is told."""
+    problems = list(stream.told.problems)
+    over = ", ".join(f"{n} of {what}" for what, n in stream.told.passed.items())
+    if over:
+        n = sum(stream.told.passed.values())
+        problems.append(f"{name}: {n} packets passed over, without ASTERIX: {over}.")
+    problems += [f"{name}: byte {first[n]}: category {n} is not read: {note}" for n, note in unread.items()]
+    return problems + broken.texts()
 
 
 def _about(path: Path, told: Told, most: int | None) -> FileContents:

@@ -1,20 +1,19 @@
 """The data blocks of a recording in memory, and what the definitions say of one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from saltus.asterix.codec import find_records
 from saltus.asterix.layout import editions, layout
-from saltus.framing import Chunk, Framer, Told, read_chunks
+from saltus.framing import Chunk
 from saltus.framing.guess import HEAD, guess
 from saltus.framing.twins import scanner
 
-__all__ = ["Blocks", "credible", "joined", "looks_like_asterix", "read_blocks"]
+__all__ = ["Blocks", "credible", "joined", "looks_like_asterix"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,27 +57,6 @@ def joined(chunks: Sequence[Chunk]) -> Blocks:
         column("at").astype(np.int64),
         bool(chunks) and all(c.dated for c in chunks),
     )
-
-
-def read_blocks(
-    path: Path,
-    framing: str | None,
-    progress: Callable[[str, float], None] | None = None,
-    most: int | None = None,
-) -> tuple[Blocks, Told]:
-    """Cut a file into blocks.
-
-    Args:
-        path: the file.
-        framing: its name; None has it guessed.
-        progress: called with the file's name and the share read.
-        most: bytes read, from the beginning; None = all.
-
-    Returns:
-        The blocks, and what was met.
-    """
-    framer = Framer(path.name, credible, framing=framing)
-    return joined(list(read_chunks(path, framer, most=most, progress=progress))), framer.told
 
 
 def looks_like_asterix(data: bytes) -> bool:
