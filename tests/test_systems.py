@@ -272,7 +272,9 @@ def test_a_source_that_makes_no_track_is_named(tmp_path):
     site = f"latitude = {lat:.9f}\nlongitude = {lon:.9f}\nheight = 0.0\n"
     (tmp_path / "c.toml").write_text(f'[[sensor]]\nname = "west"\nperiod = 0.04\n{site}')
     summary = track_files([tmp_path / "west.csv"], tmp_path / "out", tmp_path / "c.toml", report=False)
-    assert any(f"west: {len(rows)} reports and no track: is its update period 0.04 s" in p for p in summary["problems"])
+    (said,) = (p for p in summary["problems"] if "no track" in p)
+    assert "none got 3 reports in 5 update periods of 0.04 s" in said
+    assert "is the update period another" in said
 
 
 def test_an_altitude_that_nobody_tells_any_more_is_null(tmp_path):
