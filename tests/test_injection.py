@@ -89,7 +89,7 @@ def test_what_is_no_table_is_no_reference(rng, tmp_path):
     with pytest.raises(DataError, match=r"absent\.parquet: no such file"):
         downlinked(radar_plots(rng, 3), tmp_path / "absent.parquet")
     (tmp_path / "good.csv").write_text("time,latitude,longitude\n")
-    with pytest.raises(DataError, match=r"good\.csv: no Parquet table\. A reference is .*bds50_track_deg"):
+    with pytest.raises(DataError, match=r"good\.csv: no column rho_nm, .*; a reference has time, rho_nm"):
         downlinked(radar_plots(rng, 3), tmp_path / "good.csv")
 
 

@@ -12,6 +12,7 @@ from saltus.errors import ModelError
 from saltus.filters import GPB1, GPB2, IMM, Estimates, MergingRule, ParticleFilter, exact_filter, imm_filter
 from saltus.filters.align import align
 from saltus.filters.flat import Flat, flatten
+from saltus.filters.merging import findings
 from saltus.models import DiffusionSensor, HybridModel, LinearSensor, as_diffusion_sensor
 from saltus.models.arrays import Arrays
 
@@ -109,6 +110,8 @@ def _one_by_one(settings: IMM, problem: Problem, z: _Array) -> Estimates:
     bound = settings(replace(model, prior=replace(model.prior, time=0.0)))
     (name,) = model.sensors
     found = [bound.run([(t, name, row) for t, row in zip(problem.times, rows, strict=True)]) for rows in z]
+    told = [f.lost for f in found if f.lost is not None]
+    lost = np.stack(told) if len(told) == len(found) else None
     return replace(
         found[0],
         probs=np.stack([f.probs for f in found]),
@@ -118,6 +121,8 @@ def _one_by_one(settings: IMM, problem: Problem, z: _Array) -> Estimates:
         log_likelihood_start=np.zeros(len(z)),
         nis=np.stack([f.nis for f in found]),
         n_observed=np.stack([f.n_observed for f in found]),
+        lost=lost,
+        findings=() if lost is None else findings(lost, found[0].mean.shape[-1]),
     )
 
 
