@@ -16,6 +16,7 @@ WORDS = {
     "gap": "how far a filter is from the optimum",
     "summary": "a run in numbers",
     "report": "one page of HTML",
+    "engine": "sessions: setup, journal, checkpoints",
     "config": "the TOML configuration",
     "studies": "experiments that measure the filters",
     "montecarlo": "seeded runs, in order and reproducible",

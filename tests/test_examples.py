@@ -114,7 +114,7 @@ def test_a_row_without_observer_is_told(autoferry, tmp_path):
     summary = track_files([tmp_path / "holes.parquet"], tmp_path, EXAMPLES / "autoferry.toml", report=False)
     assert summary["reasons"]["site unknown"] == 2
     told = [p for p in summary["problems"] if "relative to a site" in p]
-    assert [p.partition(":")[0] for p in told] == ["ir", "lidar"]
+    assert [p.partition(":")[0] for p in told] == ["lidar", "ir"]  # as they first report
     assert all("[[sensor]]" in p and "observer_latitude" in p for p in told)
 
 

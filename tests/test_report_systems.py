@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from saltus.engine.identified import Identified
 from saltus.identify import Conflict, Decisions, DecisionSettings, Episodes, Evidence, LocalTracks, join_evidence
 from saltus.records import Plots, Source, System
 from saltus.report import pairs
@@ -19,7 +20,6 @@ from saltus.report.section import systems_section
 from saltus.report.systems import MAX_CONFLICTS, SystemsFound, bias_blocks, conflict_rows, system_rows
 from saltus.run import track_files
 from saltus.run.identified import systems_found
-from saltus.run.pipeline import Identified
 from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.membership import Segments
@@ -243,9 +243,10 @@ def test_the_page_says_what_the_tables_say(output: Path):
     tracks, systems = found["track_id"].to_numpy(), np.array(found["system"].to_pylist())
     both = np.intersect1d(tracks[systems == "near"], tracks[systems == "far"])
     assert len(both) == 5
-    _, near, far = rows_of(page, "matrix")
+    _, *rows = rows_of(page, "matrix")
     summary = json.loads((output / "summary.json").read_text())["systems"]
-    for row, name, at in ((near, "near", 1), (far, "far", 2)):
+    assert set(summary) == {"near", "far"}
+    for row, name, at in zip(rows, summary, (1, 2), strict=True):
         own, shared = summary[name]["local_tracks"], summary[name]["identified_with_another_system"]
         assert row[at] == str(own) and row[3 - at] == str(len(both))
         assert row[3:] == [str(shared), str(own - shared)]

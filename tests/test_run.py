@@ -38,6 +38,7 @@ TRACKS = {
     **dict.fromkeys(["speed_mps", "cov_ee", "cov_en", "cov_nn", "cov_uu"], pa.float64()),
     **dict.fromkeys(["cov_veve", "cov_vevn", "cov_vnvn", "p_manoeuvre_h", "p_manoeuvre_v", "p_fault"], pa.float64()),
     **dict.fromkeys(["status", "icao24", "mode3a", "callsign"], pa.string()),
+    **dict.fromkeys(["x_m", "y_m", "p_degraded", "time_known"], pa.float64()),
 }
 
 
@@ -451,7 +452,8 @@ def leftovers(folder):
 
 
 @pytest.mark.parametrize(
-    "where", ["saltus.run.tracking.place_plots", "saltus.run.command.assignment_table", "saltus.io.write.json.dumps"]
+    "where",
+    ["saltus.engine.setup.place_plots", "saltus.engine.result.assignment_table", "saltus.io.write.json.dumps"],
 )
 @pytest.mark.parametrize("older", [False, True])
 def test_ctrl_c_leaves_nothing_half_written(tmp_path, monkeypatch, where, older):

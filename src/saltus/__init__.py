@@ -34,6 +34,7 @@ _EXPORTS = {
     "MomentFilter": "saltus.filters",
     "NumericalError": "saltus.errors",
     "SaltusError": "saltus.errors",
+    "Session": "saltus.engine",
     "discretise": "saltus.models",
     "imm_filter": "saltus.filters",
     "imm_smoother": "saltus.filters",

@@ -52,8 +52,8 @@ class _Group(click.Group):
             _end(what_failed(OSError(errno.EMFILE, os.strerror(errno.EMFILE))), 2)
         except Stopped as signal:
             _end(f"ended by {signal}; nothing half-written was left", 128 + signal.number)
-        except KeyboardInterrupt:
-            _end("interrupted; nothing half-written was left", 130)
+        except KeyboardInterrupt as stopped:
+            _end(f"interrupted; {stopped or 'nothing half-written was left'}", 130)
 
 
 def _end(line: str, status: int) -> NoReturn:
@@ -118,6 +118,17 @@ def info(
 @click.option("--to", "time_to", metavar="TIME", help="Last time, HH:MM[:SS] or ISO 8601, UTC.")
 @click.option("--no-report", is_flag=True, help="Do not write report.html.")
 @click.option("--allow-empty", is_flag=True, help="Exit with 0 also when no track was found.")
+@click.option("--chunk", type=click.IntRange(min=1), metavar="N", help="Reports fed at a time; the answer is the same.")
+@click.option("--checkpoint", type=_FILE, metavar="DIR", help="Save the state into DIR on the way, and on Ctrl-C.")
+@click.option(
+    "--checkpoint-every",
+    type=click.FloatRange(min=0, min_open=True),
+    default=600.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="Seconds of data between two states.",
+)
+@click.option("--resume", is_flag=True, help="Go on from the state in DIR, with the same inputs and options.")
 def track(
     inputs: tuple[Path, ...],
     output: Path,
@@ -129,15 +140,31 @@ def track(
     time_to: str | None,
     no_report: bool,
     allow_empty: bool,
+    chunk: int | None,
+    checkpoint: Path | None,
+    checkpoint_every: float,
+    resume: bool,
 ) -> None:
     """Track recordings: tracks.parquet, assignments.parquet, summary.json, report.html in OUTPUT.
 
     Without any track these are written all the same, a note says why there is none, and the exit status is 2.
     """
-    from saltus.run import track_files
+    if resume and checkpoint is None:
+        raise click.UsageError("--resume goes on from the state that --checkpoint DIR saved: name that folder, too.")
+    from saltus.run import Feeding, track_files
 
+    feeding = Feeding(chunk or 0, checkpoint, checkpoint_every, resume)
     summary: dict[str, Any] = track_files(
-        inputs, output, config, date, identity, time_from, time_to, report=not no_report, framing=framing
+        inputs,
+        output,
+        config,
+        date,
+        identity,
+        time_from,
+        time_to,
+        report=not no_report,
+        framing=framing,
+        feeding=feeding,
     )
     if not summary["tracks"]["confirmed"] and not allow_empty:
         sys.exit(2)

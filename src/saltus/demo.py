@@ -66,14 +66,14 @@ def run_demo(output: Path, seed: int) -> None:
     from rich.console import Console
 
     from saltus.progress import progress_bar
-    from saltus.run import write_tracks
+    from saltus.run import Options, write_tracks
     from saltus.summary import show_summary
 
     console = Console(highlight=False)
     console.print(f"Two radars, {len(demo_aircraft())} aircraft, {DURATION / 60:.0f} minutes, seed {seed}.")
     with progress_bar() as bar, output_directory(output, "track", kept=_SCENE) as folder:
         simulated = _write_scene(folder, seed)
-        summary, lines = write_tracks(simulated.files, folder, bar, simulated.config)
+        summary, lines = write_tracks(simulated.files, folder, bar, Options(simulated.config))
     show_summary(summary, output, True, lines)
     tracks, assignments = (_table_of(output / f"{name}.parquet") for name in ("tracks", "assignments"))
     truth = read_reference(output / "truth.parquet")

@@ -1,36 +1,21 @@
 """What a run of the tracker found, in numbers: `summary.json`, and the lines on the screen."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 
-from saltus.geo import Plane, Site
-from saltus.records import Kind, Plots
+from saltus.engine import Result
+from saltus.engine.learn import sigmas
 from saltus.text import say, shown
 from saltus.tracks.health import Health, nis_interval, sensor_health
-from saltus.tracks.measurements import Measurements, Noise
-from saltus.tracks.noise import LEAST, NoiseEstimate
-from saltus.tracks.rows import Assignments, Rows, join_rows
-from saltus.tracks.settings import TrackerSettings
+from saltus.tracks.noise import LEAST
+from saltus.tracks.rows import join_rows
 
-__all__ = [
-    "SIGMAS",
-    "Sensors",
-    "Tracked",
-    "health_of",
-    "noise_rows",
-    "reported_kind",
-    "show_summary",
-    "sigmas",
-    "summarise",
-    "why_no_track",
-]
+__all__ = ["health_of", "noise_rows", "show_summary", "summarise", "why_no_track"]
 
 _DOUBTFUL_NIS = 3.0  # of two degrees of freedom
 _TOO_SMALL_NIS = 0.3
@@ -42,88 +27,30 @@ _UNITS = {
     "sigma_xy_m": "σ of position, m",
     "sigma_time_s": "σ of time stamps, s",
 }
-SIGMAS = {  # by what a source reports: label, field of Noise, unit
-    Kind.POLAR: (("sigma_range_m", "range", 1.0), ("sigma_azimuth_deg", "azimuth", 180.0 / np.pi)),
-    Kind.PLANE: (("sigma_xy_m", "xy", 1.0), ("sigma_time_s", "time", 1.0)),
-    Kind.BEARING: (("sigma_azimuth_deg", "azimuth", 180.0 / np.pi),),
-}
 
 
-@dataclass(frozen=True, slots=True)
-class Sensors:
-    """What is known of each source of a recording, by source index."""
-
-    sites: list[Site | None]
-    configured: list[dict[str, float]]  # fields of Noise that the configuration gives
-    periods: list[float]  # update period used, s
-    waits: list[float]  # s without a report after which a target counts as missed
-    told_periods: list[float]  # as configured or found in the recording, NaN where neither tells
-    names: list[str]
-    told_systems: list[str]  # system of each source as configured, "" where it is not
-
-
-@dataclass(frozen=True, slots=True)
-class Tracked:
-    """Everything the tracker found."""
-
-    rows: list[Rows]
-    measurements: Measurements
-    assignments: Assignments
-    plane: Plane
-    noise: dict[int, Noise]
-    estimates: dict[int, NoiseEstimate]
-
-
-def sigmas(plots: Plots, s: int) -> tuple[tuple[str, str, float], ...]:
-    """Return the standard deviations that say how good the reports of a source are: label, field of Noise, unit."""
-    kind, own = reported_kind(plots, s), plots.source == s
-    measured = kind == Kind.POLAR and np.isfinite(plots.elevation[own & (plots.kind == Kind.POLAR)]).any()
-    return SIGMAS[kind] + ((("sigma_elevation_deg", "elevation", 180.0 / np.pi),) if measured else ())
-
-
-def reported_kind(plots: Plots, s: int) -> int:
-    """What a source reports: polar where any report is, bearings where nothing else is, else plane positions."""
-    kinds = plots.kind[(plots.source == s) & (plots.kind != Kind.NONE)]
-    if (kinds == Kind.POLAR).any():
-        return Kind.POLAR
-    return Kind.BEARING if len(kinds) and (kinds == Kind.BEARING).all() else Kind.PLANE
-
-
-def summarise(
-    inputs: Sequence[Path],
-    plots: Plots,
-    sensors: Sensors,
-    tracked: Tracked,
-    tracks: pa.Table,
-    assigned: pa.Table,
-    problems: Sequence[str],
-    *,
-    several: bool = False,
-) -> dict[str, object]:
+def summarise(inputs: Sequence[Path], result: Result, problems: Sequence[str]) -> dict[str, object]:
     """Count reports, tracks and reasons, and state every source's noise.
 
     Args:
         inputs: files read.
-        plots: reports in time order.
-        sensors: what was known of the sources.
-        tracked: what the tracker found.
-        tracks: rows of tracks.parquet.
-        assigned: rows of assignments.parquet.
+        result: of the run; where states are of several systems, what may last between those widens their innovations.
         problems: lines for the user.
-        several: whether states are of several systems: what may last between those widens their innovations.
     """
+    tracked, tracks, assigned = result.tracked, result.tracks, result.assignments
     used = int(pc.sum(pc.is_valid(assigned["track_id"])).as_py() or 0)
     reasons = pc.value_counts(assigned["reason"].drop_null()).to_pylist()
     status = np.array(tracks["status"])
     ids = tracked.assignments.track_id
-    noise = _noise_table(plots, sensors, tracked)
+    noise = _noise_table(result)
     hours = float(np.ptp(tracked.measurements.time)) / 3600.0
     return {
         "version": version("saltus"),
         "inputs": [shown(Path(p).name) for p in inputs],
+        "plane": _plane(result),
         "time_from": float(tracked.measurements.time[0]),
         "time_to": float(tracked.measurements.time[-1]),
-        "reports": {"read": len(plots), "used": used, "unused": len(plots) - used},
+        "reports": {"read": len(assigned), "used": used, "unused": len(assigned) - used},
         "reasons": {r["values"]: r["counts"] for r in sorted(reasons, key=lambda r: -r["counts"])},
         "tracks": {
             "confirmed": len(tracked.assignments.confirmed),
@@ -133,18 +60,19 @@ def summarise(
             "coasted": int((status == "coasted").sum()),
         },
         "noise": noise,
-        "faults": _fault_table(health_of(sensors, tracked)),
-        "problems": [*problems, *_doubts(noise, several=several)],
+        "faults": _fault_table(health_of(result)),
+        "problems": [*problems, *_doubts(noise, several=len(result.whole.systems) > 1)],
     }
 
 
-def why_no_track(sensors: Sensors, tracked: Tracked, settings: TrackerSettings) -> str:
+def why_no_track(result: Result) -> str:
     """Say in one line why no track was confirmed: few reports, a short time, none near, or too few in a row."""
-    m, hits, scans = tracked.measurements, settings.confirm_hits, settings.confirm_scans
+    m, settings = result.tracked.measurements, result.setup.config.tracker
+    hits, scans, sensors = settings.confirm_hits, settings.confirm_scans, result.setup.sensors
     placed = np.isfinite(m.position[:, 0]) & np.isnan(m.bearing)
-    reports = tracked.assignments.track_id[placed]
+    reports = result.tracked.assignments.track_id[placed]
     reports = np.bincount(reports[reports > 0], minlength=1)
-    period = min(sensors.periods[s] for s in np.unique(m.source[placed])) if placed.any() else np.inf
+    period = min(sensors[s].period for s in np.unique(m.source[placed])) if placed.any() else np.inf
     said, span = f"no track: none got {hits} reports in {scans} update periods", float(np.ptp(m.time))
     ask = "is the update period another (period in its [[sensor]] table), or a unit wrong (NM for m, feet for m)?"
     if placed.sum() < hits:
@@ -159,40 +87,46 @@ def why_no_track(sensors: Sensors, tracked: Tracked, settings: TrackerSettings) 
     return f"{said} of {period:.3g} s; the longest of {np.sum(reports > 1)} begun got {reports.max()}: {ask}"
 
 
-def _noise_table(plots: Plots, sensors: Sensors, tracked: Tracked) -> dict[str, object]:
+def _plane(result: Result) -> dict[str, object]:
+    """Say what x_m and y_m of the tracks are."""
+    latitude, longitude = np.degrees([result.setup.plane.latitude, result.setup.plane.longitude])
+    return {
+        "projection": "stereographic, WGS-84, of scale 1 at the centre; x_m to the east and y_m to the north there",
+        "latitude": float(latitude),
+        "longitude": float(longitude),
+    }
+
+
+def _noise_table(result: Result) -> dict[str, object]:
     """State for each source what was configured, estimated and used, and whether the innovations agree."""
-    m = tracked.measurements
-    updated = [(rows.measurement, rows.d2) for rows in tracked.rows]
-    measurement = np.concatenate([np.zeros(0, np.intp), *(u[0] for u in updated)])
-    d2 = np.concatenate([np.zeros(0), *(u[1] for u in updated)])
+    rows = join_rows(result.tracked.rows)
     table: dict[str, object] = {}
-    for s, name in enumerate(sensors.names):
-        at = (measurement >= 0) & (m.source[measurement] == s) & np.isfinite(d2)
-        given, found, used = sensors.configured[s], tracked.estimates[s], tracked.noise[s]
-        row: dict[str, object] = {"system": str(plots.sources[s].system)}
-        for label, field, scale in sigmas(plots, s):
+    for s, sensor in enumerate(result.setup.sensors):
+        d2 = rows.d2[(rows.source == s) & np.isfinite(rows.d2)]
+        row: dict[str, object] = {"system": str(sensor.source.system)}
+        for label, field, scale in sigmas(sensor):
             row[label] = {
-                "configured": _rounded(given.get(field, np.nan) * scale),
-                "estimated": _rounded(getattr(found, field) * scale),
-                "used": _rounded(getattr(used, field) * scale),
+                "configured": _rounded(sensor.given.get(field, np.nan) * scale),
+                "estimated": _rounded(getattr(sensor.estimate, field) * scale),
+                "used": _rounded(getattr(sensor.noise, field) * scale),
             }
-        row["update_period_s"] = _rounded(sensors.periods[s])
-        row["nis_mean"] = _rounded(float(d2[at].mean()) if at.any() else np.nan)
+        row["update_period_s"] = _rounded(sensor.period)
+        row["nis_mean"] = _rounded(float(d2.mean()) if len(d2) else np.nan)
         row["nis_expected"] = 2.0
-        row["nis_interval"] = [_rounded(edge) for edge in nis_interval(int(at.sum()))]
-        row["nis_updates"] = int(at.sum())
-        table[name if name not in table else f"{name} ({plots.sources[s].system})"] = row
+        row["nis_interval"] = [_rounded(edge) for edge in nis_interval(len(d2))]
+        row["nis_updates"] = len(d2)
+        table[sensor.name if sensor.name not in table else f"{sensor.name} ({sensor.source.system})"] = row
     return table
 
 
-def health_of(sensors: Sensors, tracked: Tracked) -> list[Health]:
+def health_of(result: Result) -> list[Health]:
     """Gather the faults that the tracker found, by source."""
-    m, confirmed = tracked.measurements, tracked.assignments.confirmed
-    rows = join_rows(tracked.rows)
-    at = np.flatnonzero((rows.measurement >= 0) & np.isin(rows.track_id, confirmed))
+    m, found = result.tracked.measurements, result.tracked.assignments
+    rows = join_rows(result.tracked.rows)
+    at = np.flatnonzero((rows.measurement >= 0) & np.isin(rows.track_id, found.confirmed))
     plot = rows.measurement[at]
-    found = rows.p_fault[at], rows.fault[at]
-    return sensor_health(sensors.names, tracked.assignments.sources, m.source[plot], m.time[plot], *found)
+    names = [sensor.name for sensor in result.setup.sensors]
+    return sensor_health(names, found.sources, m.source[plot], m.time[plot], rows.p_fault[at], rows.fault[at])
 
 
 def _fault_table(sensors: Sequence[Health]) -> dict[str, object]:

@@ -14,6 +14,7 @@ from saltus.records import Kind
 from saltus.simulate import Leg, Radar, Trajectory, observe
 from saltus.tracks.faults import History, SourceCondition, plot_law, weighty
 from saltus.tracks.health import degraded_intervals, sensor_health
+from saltus.tracks.rows import ConditionFound
 from saltus.tracks.settings import TrackerSettings
 
 DT = 4.0
@@ -368,9 +369,8 @@ def test_spells_of_a_degraded_source():
 
 
 def test_health_counts_by_source_and_component():
-    sources = [
-        SourceCondition(plot_law(SETTINGS, Kind.POLAR if polar else Kind.PLANE), SETTINGS) for polar in (True, False)
-    ]
+    laws = [plot_law(SETTINGS, Kind.POLAR if polar else Kind.PLANE) for polar in (True, False)]
+    sources = [ConditionFound(law, History(np.zeros(0), np.zeros((0, len(law.degraded))))) for law in laws]
     found = sensor_health(
         ["radar", "ads-b"],
         sources,

@@ -5,11 +5,11 @@ import pyproj
 import pytest
 
 from saltus.config import SensorConfig
+from saltus.engine.setup import given_noise
 from saltus.errors import DataError
 from saltus.geo import Plane, Site
 from saltus.io.assemble import CATEGORIES
 from saltus.records import Kind, Plots, Source, System
-from saltus.run.command import _noise
 from saltus.tracks.measurements import Noise, default_noise, make_plane, place_plots
 
 N = 30
@@ -105,17 +105,17 @@ def test_reports_without_observer_are_seen_from_the_source_s_site(sea):
 def test_errors_that_last_average_to_what_the_filter_believes(tau):
     """The mean of many reports with errors of correlation a^|k|, against the inflation a configuration gives."""
     sensor = SensorConfig(name="ship", sigma_xy=2.0, correlation_time=tau)
-    given = _noise(sensor, period=0.5)
+    given = given_noise(sensor, period=0.5)
     n, a = 500, np.exp(-0.5 / tau)
     k = np.arange(n)
     cov = 4.0 * a ** np.abs(k[:, None] - k)
     assert given["xy"] ** 2 * given["inflation"] / n == pytest.approx(cov.mean(), rel=0.05)
-    assert "inflation" not in _noise(SensorConfig(name="ship", sigma_xy=2.0), period=0.5)
+    assert "inflation" not in given_noise(SensorConfig(name="ship", sigma_xy=2.0), period=0.5)
 
 
 @pytest.mark.parametrize(("told", "time"), [({"sigma_time": 0.05}, 0.05), ({"sigma_xy": 3.0}, 0.0), ({}, None)])
 def test_a_position_whose_noise_is_configured_has_exact_times_unless_told(told, time):
-    assert _noise(SensorConfig(name="ship", **told), period=0.5).get("time") == time
+    assert given_noise(SensorConfig(name="ship", **told), period=0.5).get("time") == time
 
 
 @pytest.mark.parametrize(("category", "time"), [(21, 0.2 / np.sqrt(12.0)), (10, 0.0)])

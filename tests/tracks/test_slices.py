@@ -51,12 +51,13 @@ def test_addresses_alone_are_counted_like_pairs(rng):
 def test_slices_cover_time_in_order(rng):
     time = np.sort(rng.uniform(0.0, 50.0, 200))
     for width in (0.6, 4.0):
-        cut = list(slices(time, width, last=True))
+        cut = list(slices(time, width, np.inf))
         assert [a for a, _ in cut] == [0, *(b for _, b in cut[:-1])]
         assert cut[-1][1] == len(time)
         assert all(time[b - 1] - time[a] <= width for a, b in cut)
-        assert list(slices(time, width, last=False)) == cut[:-1]  # whether the last one is complete is not known
-    assert list(slices(time[:0], 1.0, last=True)) == []
+        assert list(slices(time, width, -np.inf)) == cut[:-1]  # whether the last one is complete is not known
+        assert list(slices(time, width, time[cut[-1][0]] + 1.01 * width)) == cut  # nothing comes within it
+    assert list(slices(time[:0], 1.0, np.inf)) == []
 
 
 def test_slices_are_shorter_than_targets_report():

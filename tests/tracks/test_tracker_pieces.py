@@ -84,10 +84,10 @@ def test_a_tracker_restored_goes_on_as_if_nothing_had_been(name, rng):
     tracker, parts = tracker_of(m, **options), []
     for begin, end in pairwise(cuts):
         state = copy.deepcopy(tracker.state())
-        tracker.feed(m.take(np.arange(begin, len(m))), last=True)  # leave no trace in what was saved
+        tracker.feed(m.take(np.arange(begin, len(m))), until=np.inf)  # leave no trace in what was saved
         tracker = tracker_of(m, **options)
         tracker.restore(state)
-        parts.append(tracker.feed(m.take(np.arange(begin, end)), last=end == len(m)))
+        parts.append(tracker.feed(m.take(np.arange(begin, end)), until=np.inf if end == len(m) else -np.inf))
     same(whole, join_rows([p.rows for p in parts]))
     raw = assignments(m.plot, join_fates([p.fates for p in parts]), [p.confirmed for p in parts], tracker.conditions)
     for a, b in zip(found[:4], raw[:4], strict=True):
@@ -103,7 +103,7 @@ def test_what_is_not_complete_is_not_told(rng):
     width = 0.4 * 4.0
     last = m.time[np.isin(m.plot, told.fates.plot)].max()
     assert m.time[-1] - width - width < last < m.time[-1]
-    rest = tracker.feed(m.take(np.zeros(0, int)), last=True)
+    rest = tracker.feed(m.take(np.zeros(0, int)), until=np.inf)
     assert len(told.fates.plot) < len(m)
     assert set(told.fates.plot) | set(rest.fates.plot) == set(m.plot.tolist())
 
@@ -124,8 +124,7 @@ def test_memory_does_not_grow_with_time(rng):
         tracker = tracker_of(m, identity=False)
         for begin in range(0, len(m), 500):
             tracker.feed(m.take(np.arange(begin, min(begin + 500, len(m)))))
-            for source in tracker.conditions:
-                source.drained()
+            tracker.drained()
         sizes.append(size(tracker.state()))
     assert sizes[1] < 1.5 * sizes[0]
 

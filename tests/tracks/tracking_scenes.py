@@ -99,7 +99,7 @@ def fed(tracker, m, chunk=None):
     parts, step = [], chunk or max(len(m), 1)
     for begin in range(0, len(m), step):
         piece = np.arange(begin, min(begin + step, len(m)))
-        parts.append(tracker.feed(m.take(piece), last=begin + step >= len(m)))
+        parts.append(tracker.feed(m.take(piece), until=np.inf if begin + step >= len(m) else -np.inf))
     rows, fates = join_rows([p.rows for p in parts]), join_fates([p.fates for p in parts])
     return rows, assignments(m.plot, fates, [p.confirmed for p in parts], tracker.conditions)
 

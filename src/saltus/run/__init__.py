@@ -1,5 +1,7 @@
 """`saltus track`: recordings in; tracks, identities, assignments, summary and report out."""
 
-from saltus.run.command import parse_time, track_files, track_recording, write_tracks
+from saltus.run.command import Options, track_files, track_recording, write_tracks
+from saltus.run.follow import Feeding
+from saltus.times import parse_time
 
-__all__ = ["parse_time", "track_files", "track_recording", "write_tracks"]
+__all__ = ["Feeding", "Options", "parse_time", "track_files", "track_recording", "write_tracks"]

@@ -5,23 +5,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pyarrow as pa
 
+from saltus.engine.identified import Identified, bias_tables, biases, published_tracks
 from saltus.report.systems import CONFLICTS, SystemsFound
-from saltus.run.pipeline import Identified
-from saltus.tracks.bias import PARAMETERS
 from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.identities import decision_rule
 from saltus.tracks.membership import Segments
 from saltus.tracks.settings import SystemsSettings
-from saltus.tracks.systems import Registered
 
 __all__ = [
     "address_lines",
-    "bias_tables",
     "conflict_lines",
     "identification_summary",
-    "identification_table",
     "system_lines",
     "systems_found",
 ]
@@ -29,87 +24,6 @@ __all__ = [
 _LASTING = 20.0  # s: a conflict shorter than this is no line for the user
 _MOST_LINES = 8
 _FEWEST, _FAR = 3, 1000.0  # addresses in common, and m apart, from which a system's set-up is doubted
-
-
-def identification_table(whole: Identified) -> pa.Table:
-    """Return one row for each stretch of time in which a system's local track was part of a system track.
-
-    The first local track of a system track has probability 1; another one that with which it was declared the same
-    object.
-    """
-    s = whole.segments
-    names = np.repeat([x.name for x in whole.systems], [len(x.ids) for x in whole.systems])
-    labels = [label for x in whole.systems for label in x.local_id]
-    shown = _with_own(whole)
-    order = np.lexsort((s.time_from, s.system_track))
-    order = order[np.isin(s.system_track[order], shown)]
-    return pa.table(
-        {
-            "track_id": pa.array(s.system_track[order], pa.int64()),
-            "system": pa.array([str(names[k]) for k in s.track[order]], pa.string()),
-            "local_id": pa.array([labels[k] or None for k in s.track[order]], pa.string()),
-            "time_from": pa.array(s.time_from[order], pa.float64()),
-            "time_to": pa.array(s.time_to[order], pa.float64()),
-            "probability": pa.array(s.probability[order], pa.float64()),
-        }
-    )
-
-
-def _with_own(whole: Identified) -> npt.NDArray[np.int64]:
-    """System tracks that hold measurements, and not another centre's tracks alone."""
-    own = np.repeat([x.own for x in whole.systems], [len(x.ids) for x in whole.systems])
-    return np.unique(whole.segments.system_track[own[whole.segments.track]]) if len(own) else np.zeros(0, np.int64)
-
-
-def bias_tables(whole: Identified) -> dict[str, Any]:
-    """Return every system's biases against the reference: reported minus true, as of the end.
-
-    `series` holds the estimates over time, each from what was known then.
-    """
-    reference = next(r.name for r in whole.registered if r.found is None)
-    return {
-        "convention": "value = reported minus true; true is what the system named in relative_to says",
-        "reference": reference,
-        "systems": {r.name: _biases(r) for r in whole.registered if r.found is not None},
-    }
-
-
-def _biases(r: Registered) -> dict[str, Any]:
-    found = r.found
-    if found is None:
-        return {}
-    series = found.series
-    table: dict[str, Any] = {"relative_to": r.to, "compared_with": r.by, "common_objects": 0, "biases": {}}
-    table["not_estimated"] = found.not_estimated
-    if not len(series.time):
-        return table | {"series": []}
-    table["common_objects"] = int(series.objects[-1])
-    table["scatter_between_objects_m"] = _rounded(series.scatter[-1])
-    table["excess_within_objects_m"] = _rounded(found.excess_sd)
-    table["biases"] = _values(series.mean[-1], series.cov[-1], series.estimated[-1])
-    table["series"] = [
-        {"time": float(t), "common_objects": int(n), **_values(mean, cov, known)}
-        for t, n, mean, cov, known in zip(
-            series.time, series.objects, series.mean, series.cov, series.estimated, strict=True
-        )
-    ]
-    return table
-
-
-def _values(
-    mean: npt.NDArray[np.float64], cov: npt.NDArray[np.float64], known: npt.NDArray[np.bool_]
-) -> dict[str, Any]:
-    out = {}
-    for k in np.flatnonzero(known):
-        name, scale = PARAMETERS[k], 1.0
-        if name == "azimuth_rad":
-            name, scale = "azimuth_deg", float(180.0 / np.pi)
-        out[name] = {"value": _rounded(mean[k] * scale), "sd": _rounded(float(np.sqrt(cov[k, k])) * scale)}
-    return out
-
-
-def _rounded(value: float) -> float | None:
-    return float(f"{value:.4g}") if np.isfinite(value) else None
 
 
 def identification_summary(whole: Identified) -> dict[str, Any]:
@@ -197,7 +111,7 @@ def system_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
         if r.found is None:
             out.append(f"system {titles.get(r.name, r.name)}: the reference; {known}")
             continue
-        told = ", ".join(_in_words(name, b) for name, b in _biases(r)["biases"].items()) or "no bias told"
+        told = ", ".join(_in_words(name, b) for name, b in biases(r)["biases"].items()) or "no bias told"
         common = int(r.found.series.objects[-1]) if len(r.found.series.time) else 0
         pair = f"{titles.get(r.name, r.name)} minus {titles.get(r.to, r.to)}"
         way = "" if r.by == r.to else f" with {titles.get(r.by, r.by)}"
@@ -217,7 +131,7 @@ def systems_found(whole: Identified, settings: SystemsSettings, titles: Mapping[
     """Return what the report shows of several systems, None of one; `titles` are the sources' names as configured."""
     if len(whole.systems) < 2:
         return None
-    published = np.isin(whole.segments.system_track, _with_own(whole))
+    published = np.isin(whole.segments.system_track, published_tracks(whole))
     return SystemsFound(
         names=tuple(x.name for x in whole.systems),
         titles=tuple(titles.get(x.name, x.name) for x in whole.systems),

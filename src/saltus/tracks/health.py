@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.faults import History, PlotLaw, SourceCondition
+from saltus.tracks.faults import History, PlotLaw
+from saltus.tracks.rows import ConditionFound
 
 __all__ = ["NIS_FITS", "Degraded", "Health", "degraded_intervals", "nis_interval", "sensor_health"]
 
@@ -64,7 +65,7 @@ def degraded_intervals(history: History, law: PlotLaw) -> list[Degraded]:
 
 def sensor_health(
     names: Sequence[str],
-    sources: Sequence[SourceCondition],
+    sources: Sequence[ConditionFound],
     source: npt.NDArray[np.int32],
     time: _Array,
     p_fault: _Array,

@@ -20,6 +20,7 @@ __all__ = [
     "SPLIT",
     "assignment_table",
     "innovation_table",
+    "report_table",
     "track_table",
 ]
 
@@ -72,6 +73,10 @@ def track_table(rows: Rows, plane: Plane, sigma_pressure: float) -> pa.Table:
             "icao24": pa.array([f"{c:06X}" if c >= 0 else None for c in rows.icao24], pa.string()),
             "mode3a": pa.array([f"{c:04o}" if c >= 0 else None for c in rows.mode3a], pa.string()),
             "callsign": pa.array([str(c) or None for c in rows.callsign], pa.string()),
+            "x_m": mean[:, 0],
+            "y_m": mean[:, 2],
+            "p_degraded": _null_nan(rows.p_degraded),
+            "time_known": rows.time_known,
         }
     )
 
@@ -117,6 +122,17 @@ def assignment_table(plots: Plots, m: Measurements, assignments: Assignments) ->
         [alone, assignments.split, assignments.elsewhere, single], [BEARING, SPLIT, ELSEWHERE, SINGLE], NOT_CONFIRMED
     )
     reason[m.plot] = np.where(kept, "", why)
+    return report_table(plots, track_id, [str(r) for r in reason])
+
+
+def report_table(plots: Plots, track_id: npt.NDArray[np.int64], reason: Sequence[str]) -> pa.Table:
+    """Return the columns of assignments.parquet.
+
+    Args:
+        plots: reports.
+        track_id: of each, 0 none.
+        reason: why a report has no track, "" where it has one.
+    """
     sources = np.array([-1 if s.system.category is None else s.system.category for s in plots.sources] or [-1])
     category = sources[plots.source]
     return pa.table(
@@ -126,7 +142,7 @@ def assignment_table(plots: Plots, m: Measurements, assignments: Assignments) ->
             "record": pa.array(plots.record, pa.int64()),
             "time": _null_nan(plots.time),
             "track_id": pa.array(track_id, pa.int64(), mask=track_id == 0),
-            "reason": pa.array([str(r) or None for r in reason], pa.string()),
+            "reason": pa.array([r or None for r in reason], pa.string()),
         }
     )
 

@@ -1,15 +1,27 @@
 """What the tracker gives: published rows, and what became of each measurement."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.faults import SourceCondition
+from saltus.tracks.faults import History, PlotLaw
 from saltus.tracks.kinematics import Moments
+from saltus.tracks.measurements import Measurements
 
-__all__ = ["Assignments", "Fates", "Fed", "Rows", "assignments", "join_fates", "join_rows"]
+__all__ = [
+    "Assignments",
+    "ConditionFound",
+    "Fates",
+    "Fed",
+    "Rows",
+    "Tracked",
+    "assignments",
+    "join_fates",
+    "join_rows",
+]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -94,6 +106,13 @@ def join_fates(parts: Sequence[Fates]) -> Fates:
     return Fates(*(np.concatenate(column) for column in zip(nothing, *parts, strict=True)))
 
 
+class ConditionFound(NamedTuple):
+    """What was found of the condition of one source."""
+
+    law: PlotLaw
+    history: History
+
+
 class Assignments(NamedTuple):
     """What became of each measurement."""
 
@@ -101,19 +120,28 @@ class Assignments(NamedTuple):
     split: npt.NDArray[np.bool_]  # (N,): a second plot of a target already updated
     elsewhere: npt.NDArray[np.bool_]  # (N,): far from the track that has its address
     confirmed: npt.NDArray[np.int64]  # ids of the tracks that were confirmed at some time
-    sources: Sequence[SourceCondition]  # what was found of the condition of each source
+    sources: Sequence[ConditionFound]  # what was found of the condition of each source
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """Everything that trackers found."""
+
+    rows: list[Rows]  # `measurement` is a place in `measurements`
+    measurements: Measurements
+    assignments: Assignments
 
 
 def assignments(
     plot: npt.NDArray[np.int64],
     fates: Fates,
     confirmed: Sequence[npt.NDArray[np.int64]],
-    sources: Sequence[SourceCondition],
+    sources: Sequence[ConditionFound],
 ) -> Assignments:
     """Return the last fate of each plot.
 
     Args:
-        plot: numbers of the plots, ascending.
+        plot: numbers of the plots.
         fates: everything told of them.
         confirmed: ids of confirmed tracks, as told.
         sources: what was found of the condition of each source.
@@ -126,6 +154,8 @@ def assignments(
         np.unique(np.concatenate([np.zeros(0, np.int64), *confirmed])),
         sources,
     )
-    at = np.searchsorted(plot, fates.plot)
+    place = np.full(int(plot.max(initial=-1)) + 1, -1)
+    place[plot] = np.arange(n)
+    at = place[fates.plot]
     found.track_id[at], found.split[at], found.elsewhere[at] = fates[1:]
     return found

@@ -35,18 +35,18 @@ def slice_width(periods: Sequence[float], polar: Sequence[bool]) -> float:
     return min(_LONGEST, share * min(periods, default=_LONGEST))
 
 
-def slices(time: _Array, width: float, *, last: bool) -> Iterator[tuple[int, int]]:
+def slices(time: _Array, width: float, until: float) -> Iterator[tuple[int, int]]:
     """Divide times in order into short stretches; yield begin and end of each that is complete.
 
     Args:
         time: s, (n,).
         width: of a slice, s.
-        last: whether nothing follows, so that the last slice is complete, too; else it is when something later came.
+        until: nothing will follow up to this time, s; a slice is complete when it ends before, or something later came.
     """
     begin = 0
     while begin < len(time):
         end = int(np.searchsorted(time, time[begin] + width, side="right"))
-        if end == len(time) and not last:
+        if end == len(time) and time[begin] + width >= until:
             return
         yield begin, end
         begin = end

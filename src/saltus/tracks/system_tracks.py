@@ -16,7 +16,7 @@ from saltus.tracks.lifecycle import CONFIRMED
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.membership import Segments
-from saltus.tracks.rows import Assignments, Rows, join_rows
+from saltus.tracks.rows import Assignments, ConditionFound, Rows, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.slices import slices
 from saltus.tracks.splits import second_echoes
@@ -187,7 +187,7 @@ def _candidates(lanes: Lanes, scene: _Scene, lasting: float, periods: Sequence[f
     order = np.argsort(m.time[lanes.number], kind="stable")
     time = m.time[lanes.number[order]]
     used = np.unique(m.source[lanes.number])
-    for begin, end in slices(time, min([_LONGEST, *(periods[s] for s in used.tolist())]), last=True):
+    for begin, end in slices(time, min([_LONGEST, *(periods[s] for s in used.tolist())]), np.inf):
         at = order[begin:end]
         number, extra = lanes.number[at], np.zeros((end - begin, 2, 2))
         extra[several[at]] = 0.5 * lasting**2 * np.eye(2) + scene.doubt[number[several[at]]]
@@ -259,4 +259,5 @@ def _assigned(
         rest = (of[at] == 0) & (part.found.track_id > 0)
         track_id[at[rest]] = above + part.found.track_id[rest]
         above += int(part.found.track_id.max(initial=0))
-    return Assignments(track_id, split, elsewhere, np.unique(of[of > 0]), conditions)
+    told = [ConditionFound(c.law, c.history) for c in conditions]
+    return Assignments(track_id, split, elsewhere, np.unique(of[of > 0]), told)

@@ -17,7 +17,7 @@ from saltus.tracks.kinematics import make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.publish import Told, coast, updated_rows
-from saltus.tracks.rows import Fates, Fed, Rows, join_fates, join_rows
+from saltus.tracks.rows import ConditionFound, Fates, Fed, Rows, join_fates, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.sights import sight
 from saltus.tracks.slices import rounds, slices
@@ -71,26 +71,41 @@ class Tracker:
         self._sources += [SourceCondition(plot_law(self._settings, s.kind), self._settings) for s in new]
 
     @property
-    def conditions(self) -> list[SourceCondition]:
-        """The condition of each source."""
-        return self._sources
+    def conditions(self) -> list[ConditionFound]:
+        """What was found of the condition of each source, and not taken yet."""
+        return [ConditionFound(source.law, source.history) for source in self._sources]
 
-    def feed(self, measurements: Measurements, *, last: bool = False) -> Fed:
+    def drained(self) -> list[ConditionFound]:
+        """Take what was found of the condition of each source since the last time."""
+        return [ConditionFound(source.law, source.drained()) for source in self._sources]
+
+    def feed(self, measurements: Measurements, until: float = -np.inf) -> Fed:
         """Take measurements, none earlier than those before; return what is known anew.
 
         Args:
             measurements: in time order, their numbers ascending.
-            last: nothing follows within the time of a slice, so every slice is complete.
+            until: nothing will follow up to this time, s; slices that end before are complete.
         """
         m = measurements if self._pending is None else Measurements.join([self._pending, measurements])
         parts, fates, confirmed, end = [], [], [np.zeros(0, np.int64)], 0
-        for begin, end in slices(m.time, self._setup.width, last=last):
+        for begin, end in slices(m.time, self._setup.width, until):
             fed = self._slice(m.take(np.arange(begin, end)))
             parts.append(fed.rows)
             fates.append(fed.fates)
             confirmed.append(fed.confirmed)
         self._pending = m.take(np.arange(end, len(m)))
         return Fed(join_rows(parts), join_fates(fates), np.concatenate(confirmed))
+
+    def end(self) -> Fed:
+        """Take what waits as a complete slice: nothing will follow it, or only under another setup."""
+        if self._pending is None:
+            return Fed(join_rows([]), join_fates([]), np.zeros(0, np.int64))
+        return self.feed(self._pending.take(np.zeros(0, np.intp)), np.inf)
+
+    def referred(self) -> npt.NDArray[np.int64]:
+        """Return the numbers of the plots whose fate may still be told, or told again."""
+        pending = np.zeros(0, np.int64) if self._pending is None else self._pending.plot
+        return np.concatenate([self._life.plot[self._life.rows()], pending])
 
     def _slice(self, m: Measurements) -> Fed:
         """Go through one complete slice."""
@@ -132,8 +147,8 @@ class Tracker:
         self._kinematics.restore(state["bank"])
         for k, source in enumerate(self._sources):
             source.restore(state["source"][str(k)])
-        self._last.restore(state["last"])
-        self._pending = Measurements(**state["pending"]) if state["pending"] else None
+        self._last.restore(state.get("last", {}))
+        self._pending = Measurements(**state["pending"]) if state.get("pending") else None
 
     def _housekeep(self, now: float) -> None:
         """Publish what coasts; drop what is overdue or moves as no target does."""
@@ -200,9 +215,10 @@ class Tracker:
         """The last plots of rows that begin anew are their new tracks' own."""
         life, here = self._life, self._m.plot
         plots = life.plot[rows]
-        at = np.minimum(np.searchsorted(here, plots), len(here) - 1)
-        inside = here[at] == plots
-        self._track_id[at[inside]] = life.id[rows[inside]]
+        of, at = np.nonzero(plots[:, None] == here)
+        self._track_id[at] = life.id[rows[of]]
+        inside = np.zeros(len(rows), bool)
+        inside[of] = True
         self._renamed.append(np.column_stack([plots, life.id[rows]])[~inside])
 
     def _surplus(self, rows: _Index, plots: _Index) -> Measurements | None:

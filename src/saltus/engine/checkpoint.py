@@ -1,0 +1,92 @@
+"""A checkpoint: a session's state as one file of arrays and one of words, replaced as a whole."""
+
+import json
+import os
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from saltus.engine.arrays import flattened, nested
+from saltus.engine.journal import SCHEMA
+from saltus.errors import DataError
+
+__all__ = ["begin_anew", "has_checkpoint", "load_checkpoint", "save_checkpoint"]
+
+FORMAT = 1
+_POINTER = "checkpoint.json"
+
+
+def has_checkpoint(folder: Path) -> bool:
+    """Say whether a state was saved in a folder."""
+    return (folder / _POINTER).exists()
+
+
+def begin_anew(folder: Path) -> None:
+    """Forget the state saved in a folder, whose journal is about to be written anew."""
+    (folder / _POINTER).unlink(missing_ok=True)
+
+
+def save_checkpoint(folder: Path, state: Mapping[str, Any], words: Mapping[str, Any]) -> None:
+    """Write a state; a reader finds the one before until this one is whole.
+
+    Args:
+        folder: where.
+        state: nested mappings of arrays.
+        words: what is no array, fit for JSON.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    before = _pointer(folder)
+    number = 0 if before is None else int(before["number"]) + 1
+    name = f"state-{number:06d}.npz"
+    with (folder / name).open("wb") as file:
+        np.savez(file, allow_pickle=False, **dict(flattened(state)))
+        file.flush()
+        os.fsync(file.fileno())
+    written = {"format": FORMAT, "journal": SCHEMA, "saltus": version("saltus"), "number": number, "state": name}
+    temporary = folder / f".{_POINTER}.tmp"
+    with temporary.open("w", encoding="utf-8") as text:
+        json.dump({**written, "words": words}, text)
+        text.flush()
+        os.fsync(text.fileno())
+    os.replace(temporary, folder / _POINTER)
+    if before is not None:
+        (folder / str(before["state"])).unlink(missing_ok=True)
+
+
+def load_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the state and the words saved last.
+
+    Raises:
+        DataError: there is no checkpoint, it cannot be read, or another version wrote it.
+    """
+    found = _pointer(folder)
+    if found is None:
+        raise DataError(f"{folder}: holds no checkpoint ({_POINTER}). Name the folder that --checkpoint named.")
+    if (found.get("format"), found.get("journal")) != (FORMAT, SCHEMA):
+        raise DataError(
+            f"{folder}: the checkpoint is of format {found.get('format')} with a journal of version "
+            f"{found.get('journal')} (saltus {found.get('saltus')}); this is saltus {version('saltus')}, format "
+            f"{FORMAT} and version {SCHEMA}. Go on with the version that wrote it, or begin anew without --resume."
+        )
+    try:
+        with np.load(folder / str(found["state"]), allow_pickle=False) as arrays:
+            state = nested({name: arrays[name] for name in arrays.files})
+    except (OSError, ValueError, KeyError) as error:
+        raise DataError(f"{folder}: the checkpoint's {found['state']} cannot be read: {error}. Begin anew.") from error
+    return state, found["words"]
+
+
+def _pointer(folder: Path) -> dict[str, Any] | None:
+    path = folder / _POINTER
+    if not path.exists():
+        return None
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (UnicodeDecodeError, ValueError) as error:
+        raise DataError(f"{path}: no readable checkpoint: {error}. Begin anew.") from error
+    if not isinstance(found, dict):
+        raise DataError(f"{path}: no checkpoint. Begin anew.")
+    return found

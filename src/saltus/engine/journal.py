@@ -1,0 +1,131 @@
+"""The journal: everything that became known, in the order in which it did; it only grows.
+
+Tables of one kind are cut into segments of so many rows, each an Arrow file that is written once and never changed:
+`KIND-000000.arrow`. What does not yet fill a segment waits in memory and goes into a checkpoint. The columns of each
+kind are an interface, `SCHEMA` its version.
+
+| kind | a row | columns |
+| --- | --- | --- |
+| `reports` | report received, in order of arrival | `time`, `source`, `file`, `record`, `reason` |
+| `plots` | report placed, in order of time | those of `Measurements`; `plot` is the report's number, from 0 |
+| `rows` | state published by a local tracker | those of `Rows`; `system` |
+| `fates` | what became of a plot; of two the later holds | those of `Fates`; `system` |
+| `confirmed` | local track confirmed | `system`, `track_id` |
+| `conditions` | scan that told of its source's condition | `source`, `time`, `probs` of the conditions, 0 behind |
+| `refused` | report that came too late or at a wild time | `plot`, `reason` |
+| `foreign` | state of another centre's track | as its reader gives them |
+"""
+
+import os
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from saltus.engine.arrays import from_table, joined, to_table
+
+__all__ = ["SCHEMA", "Journal"]
+
+_Array = npt.NDArray[Any]
+
+SCHEMA = 1
+_ROWS = 1 << 16  # of a segment
+
+
+class Journal:
+    """Tables that grow, on disk but for the last rows of each."""
+
+    def __init__(self, folder: Path | None = None) -> None:
+        """Begin an empty journal in a folder; None: in a temporary one that goes with the journal."""
+        self._folder = Path(tempfile.mkdtemp(prefix="saltus-")) if folder is None else Path(folder)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        # A temporary folder goes with the journal, at the latest with the program.
+        self._gone = None if folder is not None else weakref.finalize(self, shutil.rmtree, self._folder, True)
+        self._sealed: dict[str, int] = {}
+        self._waiting: dict[str, list[dict[str, _Array]]] = {}
+        self._count: dict[str, int] = {}
+
+    def append(self, kind: str, columns: Mapping[str, _Array]) -> None:
+        """Add rows."""
+        n = len(next(iter(columns.values())))
+        if not n:
+            return
+        self._waiting.setdefault(kind, []).append(dict(columns))
+        self._count[kind] = self._count.get(kind, 0) + n
+        if self._count[kind] >= _ROWS:
+            self._seal(kind)
+
+    def parts(self, kind: str) -> Iterator[dict[str, _Array]]:
+        """Yield all rows of a kind, segment by segment."""
+        for k in range(self._sealed.get(kind, 0)):
+            with pa.memory_map(str(self._path(kind, k))) as source:
+                yield from_table(pa.ipc.open_file(source).read_all())
+        if self._count.get(kind):
+            yield joined(self._waiting[kind])
+
+    def all(self, kind: str) -> dict[str, _Array] | None:
+        """Return all rows of a kind at once, None without any."""
+        parts = list(self.parts(kind))
+        return joined(parts) if parts else None
+
+    def move(self, folder: Path) -> None:
+        """Go on in another folder: what is sealed is copied there."""
+        if folder.resolve() == self._folder.resolve():
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        for kind, count in self._sealed.items():
+            for k in range(count):
+                _write(folder / self._path(kind, k).name, self._path(kind, k).read_bytes())
+        self.close()
+        self._folder = folder
+
+    def close(self) -> None:
+        """Remove a temporary folder."""
+        if self._gone is not None:
+            self._gone()
+            self._gone = None
+
+    def state(self) -> dict[str, Any]:
+        """Return what `restore` goes on from: how many segments are sealed, and the rows that wait."""
+        waiting = {kind: joined(parts) for kind, parts in self._waiting.items() if self._count.get(kind)}
+        return {"sealed": {kind: np.array(n) for kind, n in self._sealed.items()}, "waiting": waiting}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on in the journal's folder from what `state` gave; segments sealed later are written anew."""
+        self._sealed = {kind: int(n) for kind, n in state.get("sealed", {}).items()}
+        self._waiting = {kind: [dict(columns)] for kind, columns in state.get("waiting", {}).items()}
+        self._count = {kind: len(next(iter(parts[0].values()))) for kind, parts in self._waiting.items()}
+
+    def _seal(self, kind: str) -> None:
+        """Write whole segments."""
+        columns = joined(self._waiting[kind])
+        n = self._count[kind]
+        for begin in range(0, n - _ROWS + 1, _ROWS):
+            part = to_table({name: values[begin : begin + _ROWS] for name, values in columns.items()})
+            sink = pa.BufferOutputStream()
+            with pa.ipc.new_file(sink, part.schema) as writer:
+                writer.write_table(part)
+            _write(self._path(kind, self._sealed.get(kind, 0)), sink.getvalue().to_pybytes())
+            self._sealed[kind] = self._sealed.get(kind, 0) + 1
+        rest = n - n % _ROWS
+        self._waiting[kind] = [{name: values[rest:].copy() for name, values in columns.items()}]
+        self._count[kind] = n % _ROWS
+
+    def _path(self, kind: str, k: int) -> Path:
+        return self._folder / f"{kind}-{k:06d}.arrow"
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file that is there as a whole or not at all."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(temporary, path)

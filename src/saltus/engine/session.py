@@ -1,0 +1,380 @@
+"""A session: reports are fed in pieces; what is known is told at once, and all of it after the end."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+
+from saltus.config import Config, load_config
+from saltus.engine.checkpoint import load_checkpoint, save_checkpoint
+from saltus.engine.intake import Arrived, Intake, Leap
+from saltus.engine.journal import Journal
+from saltus.engine.learn import first_setup, usable, with_new_sources
+from saltus.engine.local import LocalTracking
+from saltus.engine.news import News, no_identifications
+from saltus.engine.result import Result, finished
+from saltus.engine.setup import Setup, site_of
+from saltus.engine.stored import config_from, setup_from, setup_state, source_from, source_words
+from saltus.engine.stretch import Stretch
+from saltus.errors import DataError
+from saltus.progress import Progress
+from saltus.records import REASONS, Plots, Source
+from saltus.tracks.rows import Fed, Rows
+
+__all__ = ["Published", "Session"]
+
+_Index = npt.NDArray[np.int64]
+
+_SITE_UNKNOWN = REASONS.index("site unknown")
+_HOLD = 2.0  # s that reports may come late
+_CONDITIONS = 4  # most that a source has
+_FOREIGN = ("time", "track_number", "latitude", "longitude", "vx", "vy", "coasted")
+
+
+class Published(NamedTuple):
+    """What became known with the reports fed."""
+
+    tracks: pa.Table
+    assignments: pa.Table
+    identifications: pa.Table
+    health: dict[str, Any]
+
+
+class Session:
+    """Tracks reports as they come.
+
+        session = Session.open("sensors.toml")
+        published = session.feed(reports)
+        session.save(folder)              # later: session = Session.restore(folder)
+        result = session.finish()
+
+    What becomes of a report depends on those before it, on the setup and on the times that reports tell, never on the
+    pieces in which they come, nor on when a session was saved and restored.
+    """
+
+    def __init__(self, setup: Setup, *, hold: float = _HOLD, folder: Path | None = None) -> None:
+        """Begin with a setup.
+
+        Args:
+            setup: of the sources.
+            hold: s that a report may come late; 0: reports come in order of time.
+            folder: of the journal; None: a temporary one.
+        """
+        self._begin(setup.config, setup.use_identity, {}, hold, folder, Progress())
+        self._sources.extend(s.source for s in setup.sensors)
+        self._adopt(setup)
+
+    @classmethod
+    def open(
+        cls,
+        config: Config | Path | str | None = None,
+        *,
+        use_identity: bool = True,
+        periods: Mapping[str, float] | None = None,
+        hold: float = _HOLD,
+        folder: Path | None = None,
+        bar: Progress | None = None,
+    ) -> "Session":
+        """Begin without a setup: it is learnt from the first stretch of reports, which is then tracked under it.
+
+        Args:
+            config: what is known beforehand, or the TOML file that says it.
+            use_identity: whether addresses and codes count.
+            periods: update period of each source that its reader tells, by designation, s.
+            hold: s that a report may come late; 0: reports come in order of time.
+            folder: of the journal; None: a temporary one.
+            bar: shows progress.
+        """
+        session = cls.__new__(cls)
+        known = config if isinstance(config, Config) else load_config(config)
+        session._begin(known, use_identity, periods or {}, hold, folder, bar or Progress())
+        return session
+
+    def _begin(
+        self,
+        config: Config,
+        use_identity: bool,
+        periods: Mapping[str, float],
+        hold: float,
+        folder: Path | None,
+        bar: Progress,
+    ) -> None:
+        self._config, self._use_identity, self._periods, self._hold = config, use_identity, dict(periods), hold
+        self._bar, self._journal = bar, Journal(folder)
+        self._sources: list[Source] = []
+        self._files: list[str] = []
+        self._n = 0
+        self._intake, self._stretch = Intake(hold), Stretch()
+        self._setups: list[Setup] = []
+        self._locals: dict[int, LocalTracking] = {}  # by the first source of each system
+        self._news = News()
+        self.notes: dict[str, Any] = {}  # what the caller of `save` wanted to find again
+        self._ended = False
+
+    @property
+    def reports(self) -> int:
+        """How many reports were fed."""
+        return self._n
+
+    @property
+    def setup(self) -> Setup:
+        """The setup that holds now.
+
+        Raises:
+            DataError: it is not learnt yet.
+        """
+        if not self._setups:
+            raise DataError("the session has no setup yet: it is learnt from a first stretch of reports. Feed more.")
+        return self._setups[-1]
+
+    def feed(self, reports: Plots, tracks: pa.Table | None = None) -> Published:
+        """Take reports in order of arrival; return what became known.
+
+        Args:
+            reports: any number; what cannot be used carries a reason.
+            tracks: another centre's tracks up to now, with the columns of `Recording.tracks`.
+
+        Raises:
+            DataError: the session has ended, or no report can be placed.
+        """
+        if self._ended:
+            raise DataError("the session has ended; open another one.")
+        if tracks is not None and len(tracks):
+            self._journal.append("foreign", _foreign_columns(tracks))
+        plots, number = self._entered(reports)
+        good = plots.reason == 0
+        self._arrived(self._intake.add(plots.take(good), number[good]))
+        return self._published()
+
+    def finish(self) -> Result:
+        """End the session; return everything, known after the fact.
+
+        Raises:
+            DataError: nothing could be tracked.
+        """
+        if self._ended:
+            raise DataError("the session has ended; open another one.")
+        none = Plots.build(0, tuple(self._sources), tuple(self._files), {})
+        self._arrived(self._intake.end(none))
+        if not self._setups:
+            self._learn()
+        for own, tracking in self._locals.items():
+            self._tell(own, tracking.end())
+        self._ended = True
+        setup = with_new_sources(self.setup, self._sources, self.setup.time, self._periods)  # lists the unusable, too
+        result = finished(self._journal, setup, self._files, self.health())
+        self._journal.close()
+        return result
+
+    def health(self) -> dict[str, Any]:
+        """Return what is known of sources and reports."""
+        return {
+            "reports": self._n,
+            "sources": [str(s.system) for s in self._sources],
+            "setups": [s.time for s in self._setups],
+            "clock_leaps": [leap._asdict() for leap in self._intake.leaps],
+        }
+
+    def _entered(self, reports: Plots) -> tuple[Plots, _Index]:
+        """Number reports, their sources and files as the session does, and note them."""
+        source = self._numbered(reports.source, reports.sources, self._sources)
+        file = self._numbered(reports.file, reports.files, self._files)
+        plots = replace(
+            reports,
+            sources=tuple(self._sources),
+            files=tuple(self._files),
+            source=source.astype(np.int32),
+            file=file.astype(np.int32),
+        )
+        sites = [site_of(self._config.site_for(s.system)) for s in self._sources]
+        placeless = (plots.reason == 0) & ~usable(plots, sites)
+        plots = replace(plots, reason=np.where(placeless, _SITE_UNKNOWN, plots.reason).astype(np.int8))
+        number = self._n + np.arange(len(plots))
+        self._n += len(plots)
+        names = ("time", "source", "file", "record", "local_id", "reason")
+        self._journal.append("reports", {name: getattr(plots, name) for name in names})
+        self._news.enter(plots, number)
+        return plots, number
+
+    @staticmethod
+    def _numbered(index: npt.NDArray[np.int32], names: tuple[Any, ...], known: list[Any]) -> _Index:
+        """Number what reports name in the order in which it first occurs."""
+        of = np.full(len(names) + 1, -1)
+        values, first = np.unique(index, return_index=True)
+        for k in values[np.argsort(first)].tolist():
+            if k >= 0:
+                key = names[k].system if isinstance(names[k], Source) else names[k]
+                keys = [n.system if isinstance(n, Source) else n for n in known]
+                if key not in keys:
+                    known.append(names[k])
+                    keys.append(key)
+                of[k] = keys.index(key)
+        return np.asarray(of[index], np.int64)
+
+    def _arrived(self, arrived: Arrived) -> None:
+        """Track what the intake lets go, or learn the setup from it first."""
+        self._journal.append("refused", {"plot": arrived.refused, "reason": arrived.reason})
+        self._news.refuse(arrived.refused, arrived.reason)
+        plots, number = arrived.plots, arrived.number
+        if not self._setups:
+            stop = self._stretch.add(plots, number)
+            if stop > len(plots):
+                return
+            self._learn()
+            plots, number = plots.take(slice(stop, None)), number[stop:]
+        self._track(plots, number)
+
+    def _learn(self) -> None:
+        """Learn the setup from the first stretch, and track that."""
+        found = self._stretch.collected()
+        if found is None:
+            raise DataError("no report can be tracked: none of those fed is usable.")
+        plots, number = found
+        plots = self._of_sources(plots, int(plots.source.max()) + 1)
+        self._adopt(first_setup(plots, self._config, self._periods, self._bar, use_identity=self._use_identity))
+        self._stretch = Stretch()
+        self._track(plots, number)
+
+    def _of_sources(self, plots: Plots, count: int) -> Plots:
+        """Reports of the first `count` sources: what comes later has no say in what is done before."""
+        return replace(plots, sources=tuple(self._sources[:count]))
+
+    def _adopt(self, setup: Setup) -> None:
+        """Go on under a setup: systems and sources that were not there begin."""
+        self._setups.append(setup)
+        for party in setup.parties():
+            if not any(setup.sensors[s].heard for s in party.sources):
+                continue
+            own = party.sources[0]
+            if own in self._locals:
+                self._tell(own, self._locals[own].adopt(setup, party))
+            else:
+                self._locals[own] = LocalTracking(setup, party)
+
+    def _track(self, plots: Plots, number: _Index) -> None:
+        """Track reports in order of time, under a new setup from where a new source appears."""
+        while len(plots):
+            setup = self.setup
+            heard = np.array([s.heard for s in setup.sensors] + [False] * len(self._sources))
+            new = np.flatnonzero(~heard[plots.source])
+            stop = int(new[0]) if len(new) else len(plots)
+            m = setup.placed(self._of_sources(plots.take(slice(0, stop)), len(setup.sensors)), number[:stop])
+            self._journal.append("plots", m.columns())
+            for own, tracking in self._locals.items():
+                self._tell(own, tracking.feed(m))
+            plots, number = plots.take(slice(stop, None)), number[stop:]
+            if len(plots):
+                self._appeared(int(plots.source[0]), float(plots.time[0]))
+
+    def _appeared(self, source: int, time: float) -> None:
+        """Begin with a source that has not reported before."""
+        setup = self.setup
+        if source >= len(setup.sensors):
+            setup = with_new_sources(setup, self._sources[: source + 1], time, self._periods)
+        sensors = list(setup.sensors)
+        sensors[source] = replace(sensors[source], heard=True)
+        self._adopt(replace(setup, time=time, sensors=tuple(sensors)))
+
+    def _tell(self, own: int, fed: Fed) -> None:
+        """Note what a tracker knows anew."""
+        columns = {name: getattr(fed.rows, name) for name in Rows._fields if name != "moments"}
+        self._journal.append("rows", {**columns, **fed.rows.moments._asdict(), "system": _all(own, fed.rows.time)})
+        self._journal.append("fates", {**fed.fates._asdict(), "system": _all(own, fed.fates.plot)})
+        self._journal.append("confirmed", {"track_id": fed.confirmed, "system": _all(own, fed.confirmed)})
+        for source, (_, history) in enumerate(self._locals[own].drained()):
+            probs = np.zeros((len(history.time), _CONDITIONS))
+            probs[:, : history.probs.shape[1]] = history.probs
+            self._journal.append(
+                "conditions", {"source": _all(source, history.time), "time": history.time, "probs": probs}
+            )
+        self._news.tell(list(self._locals).index(own), fed)
+
+    def _published(self) -> Published:
+        kept = [tracking.referred() for tracking in self._locals.values()]
+        tables = self._news.taken(self._setups[-1] if self._setups else None, kept)
+        return Published(*tables, no_identifications(), self.health())
+
+    def save(self, folder: Path | str, words: Mapping[str, Any] | None = None) -> None:
+        """Save the session: `restore` goes on from here as if nothing had been.
+
+        Args:
+            folder: where; the journal moves there, and goes on there.
+            words: what the caller wants to find again (`notes`), fit for JSON.
+
+        Raises:
+            DataError: the session has ended.
+        """
+        if self._ended:
+            raise DataError("the session has ended: there is nothing to go on with.")
+        folder = Path(folder)
+        self._journal.move(folder)
+        setups = [setup_state(setup) for setup in self._setups]
+        state = {
+            "journal": self._journal.state(),
+            "intake": self._intake.state(),
+            "stretch": self._stretch.state(),
+            "setup": {str(k): arrays for k, (arrays, _) in enumerate(setups)},
+            "local": {str(own): tracking.state() for own, tracking in self._locals.items()},
+            "news": self._news.state(),
+        }
+        told = {
+            "config": self._config.model_dump(mode="json"),
+            "use_identity": self._use_identity,
+            "periods": self._periods,
+            "hold": self._hold,
+            "sources": [source_words(s) for s in self._sources],
+            "files": self._files,
+            "reports": self._n,
+            "setups": [words for _, words in setups],
+            "leaps": [leap._asdict() for leap in self._intake.leaps],
+            "notes": dict(words or {}),
+        }
+        save_checkpoint(folder, state, told)
+
+    @classmethod
+    def restore(cls, folder: Path | str, bar: Progress | None = None) -> "Session":
+        """Go on with a session saved.
+
+        Raises:
+            DataError: there is none, or another version saved it.
+        """
+        folder = Path(folder)
+        state, words = load_checkpoint(folder)
+        session = cls.__new__(cls)
+        config = config_from(words["config"])
+        session._begin(config, words["use_identity"], words["periods"], words["hold"], folder, bar or Progress())
+        session.notes = words["notes"]
+        session._sources.extend(source_from(s) for s in words["sources"])
+        session._files.extend(words["files"])
+        session._n = int(words["reports"])
+        for k, told in enumerate(words["setups"]):
+            session._setups.append(setup_from(state["setup"].get(str(k), {}), told))
+        like = Plots.build(0, tuple(session._sources), tuple(session._files), {})
+        session._intake.restore(state["intake"], like)
+        session._intake.leaps = [Leap(**leap) for leap in words["leaps"]]
+        session._stretch.restore(state.get("stretch", {}), like)
+        session._journal.restore(state.get("journal", {}))
+        session._news.restore(state["news"])
+        for own, local in state.get("local", {}).items():
+            party = next(p for p in session.setup.parties() if p.sources[0] == int(own))
+            session._locals[int(own)] = LocalTracking(session.setup, party)
+            session._locals[int(own)].restore(local)
+        return session
+
+
+def _all(value: int, like: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    return np.full(len(like), value, np.int32)
+
+
+def _foreign_columns(tracks: pa.Table) -> dict[str, npt.NDArray[Any]]:
+    """Another centre's tracks as arrays: numbers, and text that is empty where there is none."""
+    out: dict[str, npt.NDArray[Any]] = {}
+    for name in ("system", "mode3a", "icao24"):
+        out[name] = np.array([str(v or "") for v in tracks[name].to_pylist()], "U32")
+    for name in _FOREIGN:
+        out[name] = np.asarray(tracks[name].to_numpy(zero_copy_only=False), np.float64)
+    return out

@@ -1,0 +1,110 @@
+"""What is fixed before reports are tracked: the plane, and of every source its place, noise, period and background."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.config import Config, SensorConfig
+from saltus.geo import Plane, Site
+from saltus.records import Kind, Plots, Source
+from saltus.tracks.background import Background
+from saltus.tracks.local import Party, group_sources
+from saltus.tracks.measurements import Measurements, Noise, place_plots
+from saltus.tracks.noise import NoiseEstimate
+from saltus.tracks.slices import slice_width
+from saltus.tracks.sources import SourceSetup, TrackerSetup
+
+__all__ = ["SensorSetup", "Setup", "given_noise", "site_of"]
+
+_UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorSetup:
+    """One source."""
+
+    source: Source
+    name: str  # what people read
+    system: str  # as configured, "" where it is not
+    site: Site | None
+    given: Mapping[str, float]  # fields of `Noise` that the configuration gives
+    told_period: float  # as configured, told by the reader or learnt, s; NaN where nothing tells
+    period: float  # used
+    wait: float  # s without a report after which a target counts as missed
+    kind: int  # what it reports: `Kind.POLAR`, `Kind.PLANE` (any position) or `Kind.BEARING`
+    elevations: bool  # whether it measures these, too
+    heard: bool  # whether it gave a usable report in what the setup was learnt from
+    noise: Noise  # used
+    estimate: NoiseEstimate  # found in the first stretch
+    background: Background
+
+    def of_tracker(self) -> SourceSetup:
+        """What a tracker is told of it."""
+        return SourceSetup(self.period, self.wait, self.kind, self.background)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """Everything that holds from a time on until the next version; versions only add sources or renew estimates."""
+
+    config: Config
+    use_identity: bool
+    time: float  # from when on it holds, s
+    plane: Plane
+    sensors: tuple[SensorSetup, ...]
+
+    def parties(self) -> list[Party]:
+        """Return the systems: sources whose reports make common local tracks."""
+        names, pooled = [str(s.source.system) for s in self.sensors], [s.source.traits.pooled for s in self.sensors]
+        return group_sources(names, pooled, [s.system for s in self.sensors])
+
+    def tracker(self, party: Party) -> TrackerSetup:
+        """Return what the tracker of one system is told."""
+        own = [self.sensors[s] for s in party.sources if self.sensors[s].heard]
+        width = slice_width([s.period for s in own], [s.kind == Kind.POLAR for s in own])
+        return TrackerSetup(tuple(s.of_tracker() for s in self.sensors), width)
+
+    def placed(self, plots: Plots, number: npt.NDArray[np.int64]) -> Measurements:
+        """Put usable reports in the plane.
+
+        Args:
+            plots: reports whose sources are those of the setup, in its order.
+            number: of each report.
+        """
+        sites, noise = [s.site for s in self.sensors], {k: s.noise for k, s in enumerate(self.sensors)}
+        m = place_plots(plots, self.plane, sites, noise, self.config.tracker.height_prior)
+        return replace(m, plot=number[m.plot])
+
+
+def site_of(sensor: SensorConfig | None) -> Site | None:
+    """Return the site that the configuration gives a sensor."""
+    if sensor is None or sensor.latitude is None or sensor.longitude is None:
+        return None
+    latitude, longitude = np.radians([sensor.latitude, sensor.longitude])
+    height, sigma = _UNKNOWN_HEIGHT if sensor.height is None else (sensor.height, 0.0)
+    return Site(float(latitude), float(longitude), height, sigma)
+
+
+def given_noise(sensor: SensorConfig | None, period: float) -> dict[str, float]:
+    """Return the fields of Noise that a configuration gives.
+
+    Of errors with the correlation a^|k| between reports k periods apart, a = exp(-period / correlation_time), the mean
+    of many has (1 + a)/(1 - a) times the variance of as many independent ones: their inflation.
+    """
+    if sensor is None:
+        return {}
+    azimuth, elevation = (
+        None if sigma is None else float(np.radians(sigma)) for sigma in (sensor.sigma_azimuth, sensor.sigma_elevation)
+    )
+    given = {
+        "range": sensor.sigma_range,
+        "azimuth": azimuth,
+        "elevation": elevation,
+        "xy": sensor.sigma_xy,
+        "altitude": sensor.sigma_altitude,
+        "time": 0.0 if sensor.sigma_time is None and sensor.sigma_xy is not None else sensor.sigma_time,
+        "inflation": sensor.correlation_time and float(1.0 / np.tanh(0.5 * period / sensor.correlation_time)),
+    }
+    return {field: value for field, value in given.items() if value is not None}

@@ -1,0 +1,76 @@
+"""Lines for people on what a run could not do, and how to mend it."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from saltus.engine import Result, Setup
+from saltus.records import REASONS, Plots, Source
+
+__all__ = ["called", "nothing_left", "set_up", "without_tracks"]
+
+_MANY = 100  # positions of a source that should have made a track
+_SITE_UNKNOWN = REASONS.index("site unknown")
+
+
+def set_up(setup: Setup, unplaced: Mapping[int, int]) -> list[str]:
+    """Say what the setup lacks.
+
+    Args:
+        setup: of the sources.
+        unplaced: number of reports of each source that are relative to a site not known.
+    """
+    lines = []
+    for s, sensor in enumerate(setup.sensors):
+        if unplaced.get(s):
+            lines.append(site_wanted(sensor.source, unplaced[s]))
+        if sensor.heard and np.isnan(sensor.told_period):
+            lines.append(
+                f"{sensor.name}: the recording does not tell the update period; {sensor.period:.3g} s is assumed. "
+                "Give period (s) in its [[sensor]] table."
+            )
+    return lines
+
+
+def site_wanted(source: Source, count: int) -> str:
+    """Say that a source's site must be configured."""
+    system = source.system
+    keys = f"sac = {system.sac}, sic = {system.sic}" if system.category is not None else f'name = "{system.name}"'
+    moving = "" if system.category is not None else " A sensor that moves tells its own place: see observer_latitude."
+    return (
+        f"{system}: {count} reports are relative to a site whose position is not configured. Give it in a file "
+        f"named with --config: a [[sensor]] table with {keys}, latitude, longitude (degrees), height (m).{moving}"
+    )
+
+
+def without_tracks(result: Result) -> list[str]:
+    """Say which sources gave many positions and no track."""
+    m, found = result.tracked.measurements, result.tracked.assignments
+    sensors, placed = result.setup.sensors, np.isfinite(m.position[:, 0])
+    count = np.bincount(m.source[placed], minlength=len(sensors))
+    on = np.bincount(m.source[placed & np.isin(found.track_id, found.confirmed)], minlength=len(sensors))
+    return [
+        f"{sensors[s].name}: {count[s]} reports and no track: is its update period {sensors[s].period:.3g} s? "
+        "Give period (s) in its [[sensor]] table."
+        for s in np.flatnonzero((count >= _MANY) & (on == 0))
+    ]
+
+
+def called(setup: Setup) -> dict[str, str]:
+    """Return what people read for each designation: the name as configured, told apart where two are the same."""
+    names: dict[str, str] = {}
+    for sensor in setup.sensors:
+        system = str(sensor.source.system)
+        names[system] = f"{sensor.name} ({system})" if sensor.name in names.values() else sensor.name
+    return names
+
+
+def nothing_left(plots: Plots, problems: Sequence[str]) -> str:
+    """Say why none of the reports can be tracked."""
+    if not len(plots):
+        return "the inputs hold no target report. " + " ".join(problems)
+    counts = np.bincount(plots.reason, minlength=len(REASONS))
+    listed = ", ".join(f"{counts[k]} {REASONS[k]}" for k in np.argsort(-counts) if k and counts[k])
+    if (plots.reason == REASONS.index("system track")).all():
+        listed += " (another system's tracks are shown by saltus info and never tracked again)"
+    return " ".join([f"no report can be tracked: {listed}.", *problems])

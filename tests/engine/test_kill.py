@@ -1,0 +1,130 @@
+"""`saltus track` killed at any moment and taken up again: the same bytes as in one go."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from saltus.cli import main
+from saltus.demo import write_demo
+
+TABLES = ("tracks.parquet", "assignments.parquet", "identifications.parquet", "biases.json")
+EVERY = ("--checkpoint-every", "40", "--chunk", "200", "--no-report")
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A simulated recording of two radars, and its outputs in one go."""
+    folder = tmp_path_factory.mktemp("killed")
+    scene = write_demo(folder / "scene", 5)
+    inputs = [*map(str, scene.files), "--config", str(scene.config)]
+    result = CliRunner().invoke(main, ["track", *inputs, "-o", str(folder / "whole"), "--no-report"])
+    assert result.exit_code == 0, result.output
+    return folder, inputs
+
+
+def same_outputs(a, b):
+    for name in TABLES:
+        assert (a / name).read_bytes() == (b / name).read_bytes(), name
+    summaries = [json.loads((folder / "summary.json").read_text()) for folder in (a, b)]
+    for summary in summaries:
+        del summary["seconds"], summary["problems"]
+    assert summaries[0] == summaries[1]
+
+
+def command(*arguments):
+    return [sys.executable, "-c", "from saltus.cli import main; main()", "track", *map(str, arguments)]
+
+
+@pytest.mark.parametrize("chunk", [137, 50_000])
+def test_the_size_of_the_pieces_changes_no_byte(recording, tmp_path, chunk):
+    folder, inputs = recording
+    result = CliRunner().invoke(main, ["track", *inputs, "-o", str(tmp_path), "--no-report", "--chunk", str(chunk)])
+    assert result.exit_code == 0, result.output
+    same_outputs(folder / "whole", tmp_path)
+
+
+def test_killed_again_and_again_and_resumed(recording, tmp_path):
+    """Killed as soon as another state is saved, and at once after, until one run comes through."""
+    folder, inputs = recording
+    state, out = tmp_path / "state", tmp_path / "out"
+    arguments = [*inputs, "-o", out, "--checkpoint", state, *EVERY]
+    kills, resume = 0, []
+    rng = np.random.default_rng(1)
+    while True:
+        before = number(state)
+        run = subprocess.Popen(command(*arguments, *resume), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        while run.poll() is None and number(state) == before:
+            time.sleep(0.02)
+        time.sleep(float(rng.uniform(0.0, 0.15)))
+        if run.poll() is None and kills < 6:
+            os.kill(run.pid, signal.SIGKILL)
+            kills += 1
+        code, said = run.wait(), run.stderr.read().decode()
+        run.stderr.close()
+        if code == 0:
+            break
+        assert code == -signal.SIGKILL, said
+        assert not out.exists()
+        resume = ["--resume"]
+    assert kills >= 2
+    same_outputs(folder / "whole", out)
+
+
+def number(state):
+    """The number of the state saved last."""
+    try:
+        return json.loads((state / "checkpoint.json").read_text())["number"]
+    except FileNotFoundError:
+        return -1
+
+
+def test_ctrl_c_saves_the_state(recording, tmp_path):
+    folder, inputs = recording
+    state, out = tmp_path / "state", tmp_path / "out"
+    arguments = [
+        *inputs,
+        "-o",
+        out,
+        "--checkpoint",
+        state,
+        "--checkpoint-every",
+        "1e9",
+        "--chunk",
+        "100",
+        "--no-report",
+    ]
+    code = (
+        "import os, signal; from saltus.engine import Session; feed = Session.feed\n"
+        "def fed(self, *rest):\n"
+        "    told = feed(self, *rest)\n"
+        "    if self.reports >= 3000: os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return told\n"
+        "Session.feed = fed; from saltus.cli import main; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "track", *map(str, arguments)], capture_output=True, text=True)
+    assert done.returncode == 130
+    assert f"interrupted; the state is saved in {state}; go on from there with --resume" in done.stderr
+    assert not out.exists()
+    result = CliRunner().invoke(main, ["track", *map(str, arguments), "--resume"])
+    assert result.exit_code == 0, result.output
+    assert "went on from report 3000" in result.output
+    same_outputs(folder / "whole", out)
+
+
+def test_other_inputs_and_options_are_not_taken_for_the_same(recording, tmp_path):
+    _, inputs = recording
+    state = tmp_path / "state"
+    arguments = ["track", *inputs, "-o", str(tmp_path / "out"), "--checkpoint", str(state), *EVERY]
+    first = CliRunner().invoke(main, [*arguments, "--resume"])
+    assert first.exit_code == 0 and "holds no state yet: begun from the first report" in first.output
+    other = CliRunner().invoke(main, [*arguments, "--resume", "--identity", "ignore"])
+    assert other.exit_code == 2 and "changed since are --identity" in other.output
+    alone = CliRunner().invoke(main, ["track", *inputs, "-o", str(tmp_path / "out"), "--resume"])
+    assert alone.exit_code == 2 and "--resume goes on from the state that --checkpoint DIR saved" in alone.output

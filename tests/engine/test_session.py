@@ -1,0 +1,219 @@
+"""Sessions: the same answer in pieces of any size, saved and restored at any moment; what they publish on the way."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from saltus import Session
+from saltus.config import load_config
+from saltus.engine import Setup
+from saltus.errors import DataError
+from saltus.geo import Plane, Site
+from saltus.records import REASONS, Kind, Plots, Source, System, Traits
+from saltus.simulate import Leg, Radar, Trajectory, observe
+
+SITES = (Site(*np.radians([48.0, 11.0]).tolist(), 500.0), Site(*np.radians([48.1, 11.4]).tolist(), 300.0))
+PLANE = Plane(SITES[0].latitude, SITES[0].longitude)
+SECONDS = 120.0
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    text = ""
+    for sic, site in enumerate(SITES, start=1):
+        text += f"[[sensor]]\nsac = 1\nsic = {sic}\nheight = {site.height}\n"
+        text += f"latitude = {np.degrees(site.latitude):.9f}\nlongitude = {np.degrees(site.longitude):.9f}\n"
+    path = tmp_path_factory.mktemp("engine") / "sensors.toml"
+    path.write_text(text)
+    return path
+
+
+def scene(radars, seed=1, seconds=SECONDS):
+    """Reports of radars that see eight aircraft, with clutter, in order of time."""
+    rng = np.random.default_rng(seed)
+    flights = [
+        Trajectory(
+            (*rng.uniform(-4e4, 4e4, 2).tolist(), float(rng.uniform(3e3, 1e4))),
+            float(rng.uniform(0.0, 6.28)),
+            float(rng.uniform(120.0, 240.0)),
+            (Leg(40.0), Leg(40.0, turn_rate=0.03), Leg(seconds)),
+        )
+        for _ in range(8)
+    ]
+    codes = np.array([*(0x3C6444 + np.arange(4)), -1, -1, -1, -1, -1], np.int32)
+    columns = {}
+    for k in range(radars):
+        radar = Radar(SITES[k], 4.0 + k, 30.0, 1e-3, 10.0, clutter_per_scan=3.0, north_time=0.7 * k)
+        seen = observe(radar, flights, PLANE, 0.0, seconds, rng)
+        part = {"time": seen.time, "range": seen.slant, "azimuth": seen.azimuth, "altitude": seen.altitude}
+        part |= {"source": np.full(len(seen.time), k), "icao24": codes[seen.target]}
+        for name, values in part.items():
+            columns.setdefault(name, []).append(values)
+    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    n = len(whole["time"])
+    whole |= {"file": np.zeros(n), "record": np.arange(n), "kind": np.full(n, Kind.POLAR)}
+    sources = tuple(Source(System(48, 1, k + 1), Traits(rotating=True)) for k in range(radars))
+    return Plots.build(n, sources, ("simulated",), whole).sorted_by_time()
+
+
+def tables(result):
+    return [result.tracks, result.assignments, result.identifications]
+
+
+def equal(a, b):
+    assert json.dumps(a.biases) == json.dumps(b.biases)
+    for x, y in zip(tables(a), tables(b), strict=True):
+        assert x.schema == y.schema
+        assert x.combine_chunks().equals(y.combine_chunks())
+        for name in x.column_names:  # NaN and the last bit included
+            old, new = x[name].to_numpy(zero_copy_only=False), y[name].to_numpy(zero_copy_only=False)
+            assert old.dtype.kind == "O" or old.tobytes() == new.tobytes()
+
+
+def fed(config, plots, cuts=(), **options):
+    session = Session.open(config, **options)
+    edges = [0, *cuts, len(plots)]
+    told = [session.feed(plots.take(slice(a, b))) for a, b in pairwise(edges)]
+    return session.finish(), told
+
+
+@pytest.mark.parametrize("radars", [1, 2])
+def test_pieces_of_any_size_give_the_same_bytes(config, radars, rng):
+    plots = scene(radars)
+    whole, _ = fed(config, plots)
+    assert len(whole.assignments) == len(plots) and len(whole.tracks) > 150
+    for cuts in (
+        range(1, len(plots), 3),
+        range(100, len(plots), 100),
+        np.sort(rng.choice(len(plots), 9, replace=False)),
+    ):
+        equal(whole, fed(config, plots, [int(c) for c in cuts])[0])
+
+
+def test_reports_that_come_in_disorder_change_nothing(config, rng):
+    """Each up to 1.5 s late, as the hold allows: the tracks are those of the reports in order."""
+    plots = scene(2)
+    shuffled = plots.take(np.argsort(plots.time + rng.uniform(0.0, 1.5, len(plots)), kind="stable"))
+    whole, other = fed(config, plots)[0], fed(config, shuffled)[0]
+    assert whole.tracks.combine_chunks().equals(other.tracks.combine_chunks())
+    for column in ("track_id", "reason"):
+        of = [r.assignments.sort_by("record")[column].to_pylist() for r in (whole, other)]
+        assert of[0] == of[1]
+
+
+@pytest.mark.parametrize("radars", [1, 2])
+def test_a_session_saved_at_any_moment_goes_on(config, radars, rng, tmp_path):
+    """At eight moments, each time saved, forgotten and taken up by another one; before and after the first stretch."""
+    plots = scene(radars, seconds=630.0)
+    whole, _ = fed(config, plots)
+    cuts = np.sort(rng.choice(len(plots), 8, replace=False)).tolist()
+    session = Session.open(config)
+    for begin, end in zip([0, *cuts], [*cuts, len(plots)], strict=True):
+        session.feed(plots.take(slice(begin, end)))
+        session.save(tmp_path / "state", {"at": end})
+        lost = session
+        session = Session.restore(tmp_path / "state")
+        assert session.reports == end and session.notes == {"at": end}
+        lost.feed(plots.take(slice(end, end + 500)))  # what happens to the other one afterwards is its own affair
+    equal(whole, session.finish())
+
+
+def test_what_is_published_on_the_way_is_what_is_known_in_the_end(config):
+    plots = scene(1, seconds=700.0)
+    result, told = fed(config, plots, range(200, len(plots), 200))
+    assert not len(told[0].tracks) and not len(told[0].assignments)  # the setup is not learnt yet
+    rows = {}
+    for part in told:
+        for row in part.tracks.to_pylist():
+            rows[row["track_id"], row["time"], row["status"]] = row
+    final = result.tracks.to_pylist()
+    known = [row for row in final if row["time_known"] < told[-1].tracks["time_known"].to_numpy().min()]
+    assert len(known) > 300
+    assert all(rows[row["track_id"], row["time"], row["status"]] == row for row in known)
+    order = [(row["time_known"], row["track_id"], row["time"]) for row in final]
+    assert order == sorted(order)
+    last = {}
+    for part in told:
+        last |= {row["record"]: row["track_id"] for row in part.assignments.to_pylist()}
+    confirmed = {row["track_id"] for row in final}
+    for row in result.assignments.to_pylist():
+        if row["record"] in last:
+            assert row["track_id"] == (last[row["record"]] if last[row["record"]] in confirmed else None)
+
+
+def test_a_source_that_appears_later_begins_with_its_configuration(config):
+    """The second radar reports from 620 s on: a version of the setup tells when, and its reports make tracks."""
+    plots = scene(2, seconds=720.0)
+    plots = plots.take((plots.source == 0) | (plots.time > 620.0))
+    result, _ = fed(config, plots)
+    versions = Session.open(config)
+    versions.feed(plots)
+    times = versions.health()["setups"]
+    assert len(times) == 2 and 620.0 < times[1] < 625.0
+    late = np.array(result.assignments["time"]) > 650.0
+    of_second = plots.source == 1
+    used = np.array(result.assignments["track_id"].is_valid())
+    assert used[late & of_second].mean() > 0.6  # eight aircraft of nine in ten scans, beside three false plots
+    equal(result, fed(config, plots, range(333, len(plots), 333))[0])
+
+
+def test_a_setup_learnt_before_begins_at_once(config):
+    """A session begun with another one's setup tracks the first reports as soon as their slice is complete."""
+    plots = scene(1, seconds=700.0)
+    learnt = Session.open(config)
+    learnt.feed(plots)
+    session = Session(learnt.setup)
+    told = session.feed(plots.take(slice(0, 200)))
+    assert len(told.tracks) > 0 and len(told.assignments) > 100
+    session.feed(plots.take(slice(200, None)))
+    equal(session.finish(), learnt.finish())
+
+
+def test_every_report_has_a_reason_or_a_track(config):
+    plots = scene(2)
+    reason = plots.reason.copy()
+    reason[5] = REASONS.index("duplicate")
+    stranger = replace(
+        plots, sources=(plots.sources[0], Source(System(48, 9, 9), Traits(rotating=True))), reason=reason
+    )
+    result, _ = fed(config, stranger)
+    found = result.assignments
+    assert found["reason"].to_pylist()[5] == "duplicate"
+    why = np.array(found["reason"].to_pylist(), object)
+    assert (why[(plots.source == 1) & (reason == 0)] == "site unknown").all()
+    assert (found["track_id"].is_valid().to_numpy() ^ found["reason"].is_valid().to_numpy()).all()
+
+
+def test_a_session_without_usable_reports_says_so(config):
+    session = Session.open(config)
+    with pytest.raises(DataError, match="no setup yet"):
+        assert isinstance(session.setup, Setup)
+    session.feed(scene(1).take(slice(0, 0)))
+    with pytest.raises(DataError, match="no report can be tracked"):
+        session.finish()
+
+
+def test_what_is_no_checkpoint_is_said(config, tmp_path):
+    with pytest.raises(DataError, match="holds no checkpoint"):
+        Session.restore(tmp_path)
+    session = Session.open(load_config(config))
+    session.feed(scene(1))
+    session.save(tmp_path)
+    pointer = tmp_path / "checkpoint.json"
+    found = json.loads(pointer.read_text())
+    pointer.write_text(json.dumps({**found, "format": 99}))
+    with pytest.raises(DataError, match=r"format 99 .* Go on with the version that wrote it"):
+        Session.restore(tmp_path)
+    pointer.write_text(json.dumps(found)[:-20])
+    with pytest.raises(DataError, match="no readable checkpoint"):
+        Session.restore(tmp_path)
+    pointer.write_text(json.dumps(found))
+    (tmp_path / found["state"]).write_bytes(b"PK")
+    with pytest.raises(DataError, match="cannot be read"):
+        Session.restore(tmp_path)
+    session.finish()
+    with pytest.raises(DataError, match="has ended"):
+        session.feed(scene(1))
