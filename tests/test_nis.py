@@ -5,7 +5,7 @@ import pytest
 
 from saltus.io.asterix_write import write_cat048
 from saltus.progress import Progress
-from saltus.run import write_tracks
+from saltus.run import Options, write_tracks
 
 SIGMA_RANGE, SIGMA_AZIMUTH = 60.0, 0.08  # m, degrees
 
@@ -32,7 +32,7 @@ def nis(folder, seed, factor):
         "date = 2025-06-01\n[[sensor]]\nsac = 25\nsic = 1\nlatitude = 48.0\nlongitude = 11.0\nheight = 500.0\n"
         f"period = 4.0\nsigma_range = {factor * SIGMA_RANGE}\nsigma_azimuth = {factor * SIGMA_AZIMUTH}\n"
     )
-    (row,) = write_tracks([folder / "radar.ast"], folder, Progress(), folder / "a.toml", report=False)[0][
+    (row,) = write_tracks([folder / "radar.ast"], folder, Progress(), Options(folder / "a.toml", report=False))[0][
         "noise"
     ].values()
     assert row["nis_updates"] > 1400
