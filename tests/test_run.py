@@ -192,8 +192,9 @@ def test_numbers_are_finite_and_covariances_positive(two):
         assert (a * c > b * b).all()
     for p in ("p_manoeuvre_h", "p_manoeuvre_v"):
         assert ((out[p].to_numpy() >= 0) & (out[p].to_numpy() <= 1)).all()
-    time = out["time"].to_numpy()
-    assert (np.diff(time) >= 0).all()
+    time, *rest = (out[name].to_numpy() for name in ("time", "track_id", "time_known"))
+    order = [time, *rest]
+    assert (np.lexsort(order) == np.arange(len(out))).all()
     assert time[0] >= MIDNIGHT + START
 
 
