@@ -217,7 +217,7 @@ def test_a_signal_ends_the_program_and_leaves_nothing(recording, tmp_path, numbe
     path, config = recording
     code = (
         "import os, signal, saltus.run.command as command\n"
-        f"command.track_plots = lambda *_, **__: os.kill(os.getpid(), {int(number)})\n"
+        f"command.follow = lambda *_, **__: os.kill(os.getpid(), {int(number)})\n"
         "from saltus.cli import main; main()"
     )
     arguments = ["track", path, "-o", tmp_path / "out", "--config", config]

@@ -20,7 +20,7 @@ from saltus.report.settings import UNITS
 from saltus.report.updates import groups, read_updates
 from saltus.tracks.health import Degraded, Health
 from saltus.tracks.registration import RegistrationSettings
-from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
+from saltus.tracks.settings import FilterSettings, SetupSettings, SystemsSettings, TrackerSettings
 
 T0 = 1_700_000_000.0
 SITE = Site(np.radians(41.3), np.radians(2.1), 27.3, 0.0)
@@ -399,7 +399,7 @@ def test_any_summary_becomes_tables():
 
 def test_run_has_dates_and_units(tmp_path):
     kinds = {"tracker": TrackerSettings, "filter": FilterSettings, "systems": SystemsSettings}
-    kinds |= {"registration": RegistrationSettings}
+    kinds |= {"registration": RegistrationSettings, "setup": SetupSettings}
     for group, units in UNITS.items():
         assert set(units) <= {field.name for field in fields(kinds[group])}
     chosen = {"tracker": {"max_speed": 400.0, "coast_seconds": 20.0}, "filter": {"accel_h": (0.15, 3.0)}}

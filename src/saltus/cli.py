@@ -53,7 +53,7 @@ class _Group(click.Group):
         except Stopped as signal:
             _end(f"ended by {signal}; nothing half-written was left", 128 + signal.number)
         except KeyboardInterrupt as stopped:
-            _end(f"interrupted; {stopped or 'nothing half-written was left'}", 130)
+            _end(f"interrupted; {str(stopped) or 'nothing half-written was left'}", 130)
 
 
 def _end(line: str, status: int) -> NoReturn:

@@ -25,6 +25,7 @@ system = "platform"               # optional: sources of one system make common 
 21 = "0.23"                       # category = edition; others are guessed
 
 [reading]                         # fields of saltus.io.ReadingSettings
+[setup]                           # fields of saltus.tracks.settings.SetupSettings
 [tracker]                         # fields of saltus.tracks.settings.TrackerSettings
 [filter]                          # fields of saltus.tracks.settings.FilterSettings
 [systems]                         # fields of saltus.tracks.settings.SystemsSettings
@@ -48,7 +49,7 @@ from saltus.io.settings import ReadingSettings
 from saltus.records import System
 from saltus.text import brief, cut, shown
 from saltus.toml import load_toml
-from saltus.tracks.settings import FilterSettings, RegistrationSettings, SystemsSettings, TrackerSettings
+from saltus.tracks.settings import FilterSettings, RegistrationSettings, SetupSettings, SystemsSettings, TrackerSettings
 
 __all__ = ["Config", "SensorConfig", "load_config", "parse_date"]
 
@@ -74,7 +75,8 @@ _HINTS = {
 }
 
 _YEARS = 1970, 2100  # of a recording: times count from the first, reports after the last are out of range
-T = TypeVar("T", ReadingSettings, TrackerSettings, FilterSettings, SystemsSettings, RegistrationSettings)
+_Settings = ReadingSettings | SetupSettings | TrackerSettings | FilterSettings | SystemsSettings | RegistrationSettings
+T = TypeVar("T", bound=_Settings)
 _Octet = Annotated[int, Field(ge=0, le=255)]
 _Sigma = Annotated[float, Field(gt=0.0, le=1e4)]
 
@@ -131,6 +133,7 @@ class Config(BaseModel):
     sensor: tuple[SensorConfig, ...] = ()
     editions: dict[int, str] = Field(default_factory=dict)
     reading: ReadingSettings = Field(default_factory=ReadingSettings)
+    setup: SetupSettings = Field(default_factory=SetupSettings)
     tracker: TrackerSettings = Field(default_factory=TrackerSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
     systems: SystemsSettings = Field(default_factory=SystemsSettings)
@@ -166,6 +169,7 @@ def _load(path: Path | str) -> Config:
     _known(path, "", content, Config.model_fields)
     values: dict[str, object] = {
         "reading": _settings(path, "reading", content.get("reading", {}), ReadingSettings),
+        "setup": _settings(path, "setup", content.get("setup", {}), SetupSettings),
         "tracker": _settings(path, "tracker", content.get("tracker", {}), TrackerSettings),
         "filter": _settings(path, "filter", content.get("filter", {}), FilterSettings),
         "systems": _settings(path, "systems", content.get("systems", {}), SystemsSettings),

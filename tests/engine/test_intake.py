@@ -10,6 +10,7 @@ from saltus.engine.arrays import flattened, from_table, nested, to_table
 from saltus.engine.intake import Intake
 from saltus.engine.stretch import Stretch
 from saltus.records import REASONS, Plots, Source, System
+from saltus.tracks.settings import SetupSettings
 
 SOURCES = tuple(Source(System(None, None, None, name)) for name in "abc")
 LATE, JUMP = REASONS.index("out of order"), REASONS.index("clock jump")
@@ -99,7 +100,7 @@ def test_the_first_stretch_ends_when_every_source_gave_enough(chunk):
         (np.concatenate([a, b]), np.repeat([0, 1], [len(a), len(b)]), 12001 + 600),
     ):
         order = np.argsort(time, kind="stable")
-        plots, taken, stretch = reports(time[order], source[order]), 0, Stretch()
+        plots, taken, stretch = reports(time[order], source[order]), 0, Stretch(SetupSettings())
         for begin in range(0, len(plots), chunk):
             part = plots.take(slice(begin, begin + chunk))
             stop = stretch.add(part, np.arange(begin, begin + len(part)))

@@ -1,11 +1,9 @@
 """`saltus track` killed at any moment and taken up again: the same bytes as in one go."""
 
 import json
-import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -20,10 +18,12 @@ EVERY = ("--checkpoint-every", "40", "--chunk", "200", "--no-report")
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A simulated recording of two radars, and its outputs in one go."""
+    """A simulated recording of two radars, a minute of it for the setup, and its outputs in one go."""
     folder = tmp_path_factory.mktemp("killed")
     scene = write_demo(folder / "scene", 5)
-    inputs = [*map(str, scene.files), "--config", str(scene.config)]
+    config = folder / "config.toml"
+    config.write_text(scene.config.read_text() + "\n[setup]\nseconds = 60.0\n")
+    inputs = [*map(str, scene.files), "--config", str(config)]
     result = CliRunner().invoke(main, ["track", *inputs, "-o", str(folder / "whole"), "--no-report"])
     assert result.exit_code == 0, result.output
     return folder, inputs
@@ -38,10 +38,6 @@ def same_outputs(a, b):
     assert summaries[0] == summaries[1]
 
 
-def command(*arguments):
-    return [sys.executable, "-c", "from saltus.cli import main; main()", "track", *map(str, arguments)]
-
-
 @pytest.mark.parametrize("chunk", [137, 50_000])
 def test_the_size_of_the_pieces_changes_no_byte(recording, tmp_path, chunk):
     folder, inputs = recording
@@ -50,39 +46,43 @@ def test_the_size_of_the_pieces_changes_no_byte(recording, tmp_path, chunk):
     same_outputs(folder / "whole", tmp_path)
 
 
-def test_killed_again_and_again_and_resumed(recording, tmp_path):
-    """Killed as soon as another state is saved, and at once after, until one run comes through."""
+def test_killed_at_any_moment_and_resumed(recording, tmp_path):
+    """Killed from outside at random moments, while states are written above all, until a run comes through."""
     folder, inputs = recording
     state, out = tmp_path / "state", tmp_path / "out"
     arguments = [*inputs, "-o", out, "--checkpoint", state, *EVERY]
-    kills, resume = 0, []
+    resume, codes = [], []
     rng = np.random.default_rng(1)
-    while True:
-        before = number(state)
-        run = subprocess.Popen(command(*arguments, *resume), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-        while run.poll() is None and number(state) == before:
-            time.sleep(0.02)
-        time.sleep(float(rng.uniform(0.0, 0.15)))
-        if run.poll() is None and kills < 6:
-            os.kill(run.pid, signal.SIGKILL)
-            kills += 1
-        code, said = run.wait(), run.stderr.read().decode()
-        run.stderr.close()
-        if code == 0:
+    for moment in (*rng.integers(1, 20, 6).tolist(), 10**6):
+        run = subprocess.run(
+            [sys.executable, "-c", KILLED, str(moment), "track", *map(str, arguments), *resume], capture_output=True
+        )
+        codes.append(run.returncode)
+        assert run.returncode in (0, -signal.SIGKILL), run.stderr.decode()
+        assert out.exists() == (run.returncode == 0)
+        if run.returncode == 0:
             break
-        assert code == -signal.SIGKILL, said
-        assert not out.exists()
         resume = ["--resume"]
-    assert kills >= 2
+    assert codes.count(-signal.SIGKILL) >= 3
     same_outputs(folder / "whole", out)
 
 
-def number(state):
-    """The number of the state saved last."""
-    try:
-        return json.loads((state / "checkpoint.json").read_text())["number"]
-    except FileNotFoundError:
-        return -1
+# Killed a moment after the piece, counted from the start of the program, that its first argument tells.
+KILLED = """
+import os, signal, sys, threading
+from saltus.engine import Session
+moment, feed = int(sys.argv.pop(1)), Session.feed
+def fed(self, *rest):
+    global moment
+    told = feed(self, *rest)
+    moment -= 1
+    if moment == 0:
+        threading.Timer(0.01, os.kill, (os.getpid(), signal.SIGKILL)).start()
+    return told
+Session.feed = fed
+from saltus.cli import main
+main()
+"""
 
 
 def test_ctrl_c_saves_the_state(recording, tmp_path):

@@ -108,7 +108,7 @@ class Session:
         self._sources: list[Source] = []
         self._files: list[str] = []
         self._n = 0
-        self._intake, self._stretch = Intake(hold), Stretch()
+        self._intake, self._stretch = Intake(hold), Stretch(config.setup)
         self._setups: list[Setup] = []
         self._locals: dict[int, LocalTracking] = {}  # by the first source of each system
         self._news = News()
@@ -236,7 +236,7 @@ class Session:
         plots, number = found
         plots = self._of_sources(plots, int(plots.source.max()) + 1)
         self._adopt(first_setup(plots, self._config, self._periods, self._bar, use_identity=self._use_identity))
-        self._stretch = Stretch()
+        self._stretch = Stretch(self._config.setup)
         self._track(plots, number)
 
     def _of_sources(self, plots: Plots, count: int) -> Plots:

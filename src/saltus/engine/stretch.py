@@ -8,19 +8,19 @@ import numpy.typing as npt
 
 from saltus.engine.intake import joined_plots
 from saltus.records import Plots
+from saltus.tracks.settings import SetupSettings
 
 __all__ = ["Stretch"]
 
 _Index = npt.NDArray[np.int64]
 
-_REPORTS, _SECONDS = 5_000, 600.0  # of each source present, or since the first report: then it is long enough
-
 
 class Stretch:
     """Collects usable reports in order of time until there are enough."""
 
-    def __init__(self) -> None:
+    def __init__(self, settings: SetupSettings) -> None:
         """Begin with none."""
+        self._settings = settings
         self._plots: list[Plots] = []
         self._number: list[_Index] = []
         self._count = np.zeros(0, np.int64)  # reports of each source
@@ -29,7 +29,7 @@ class Stretch:
     def add(self, plots: Plots, number: _Index) -> int:
         """Take reports; return how many of them complete the stretch, one more than there are where none does.
 
-        The stretch is complete with the first report by which every source present gave 5 000, or 600 s passed.
+        The stretch is complete with the first report by which every source present gave enough, or time is up.
         """
         if not len(plots):
             return 1
@@ -38,7 +38,8 @@ class Stretch:
         seen = np.zeros((len(plots), size), np.int64)
         seen[np.arange(len(plots)), plots.source] = 1
         count = np.cumsum(seen, axis=0) + np.pad(self._count, (0, size - len(self._count)))
-        enough = ((count >= _REPORTS) | (count == 0)).all(axis=1) | (plots.time - self._start >= _SECONDS)
+        each = ((count >= self._settings.reports) | (count == 0)).all(axis=1)
+        enough = each | (plots.time - self._start >= self._settings.seconds)
         stop = int(enough.argmax()) + 1 if enough.any() else len(plots) + 1
         taken = min(stop, len(plots))
         self._plots.append(plots.take(slice(0, taken)))

@@ -7,6 +7,7 @@ __all__ = ["UNITS", "readable"]
 
 # Units of the settings whose names carry none, as endings that `title` writes out.
 UNITS: dict[str, dict[str, str]] = {
+    "setup": {"seconds": "s"},
     "tracker": {
         "clutter_density": "perm2",
         "clutter_density_azimuth": "perrad",

@@ -140,7 +140,7 @@ def write_tracks(
     summary["systems"] = identification_summary(whole)
     summary["settings"] = {
         "identity": given.identity,
-        **{name: asdict(getattr(config, name)) for name in ("tracker", "filter", "systems", "registration")},
+        **{name: asdict(getattr(config, name)) for name in ("setup", "tracker", "filter", "systems", "registration")},
     }
     summary["seconds"] = {"decoding": round(decoded - began, 2), "tracking": round(done - decoded, 2)}
     _write(folder, result, summary)

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from saltus.errors import ModelError
 
-__all__ = ["FilterSettings", "RegistrationSettings", "SystemsSettings", "TrackerSettings"]
+__all__ = ["FilterSettings", "RegistrationSettings", "SetupSettings", "SystemsSettings", "TrackerSettings"]
 
 _FASTEST_TURN = 45.0  # degrees/s: faster, a turn is a circle between two plots
 
@@ -256,3 +256,26 @@ class RegistrationSettings:
         azimuth = float(np.radians(self.sigma_azimuth))
         offset = self.sigma_offset
         return np.array([offset, offset, azimuth, self.sigma_range, self.sigma_range_scale, self.sigma_time])
+
+
+@dataclass(frozen=True, slots=True)
+class SetupSettings:
+    """The first stretch of reports, from which noise, update periods and backgrounds are learnt.
+
+    It ends when every source present gave `reports` of them, or after `seconds`; then it is tracked, and until then
+    nothing is published.
+
+    Attributes:
+        reports: of each source.
+        seconds: of data, at the longest.
+    """
+
+    reports: int = 5_000
+    seconds: float = 600.0
+
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot be."""
+        if not self.reports >= 1:
+            raise ModelError(f"setup.reports is a number of reports, 1 or more, got {self.reports}.")
+        if not 0.0 < self.seconds < np.inf:
+            raise ModelError(f"setup.seconds must be positive and finite, got {self.seconds}.")
