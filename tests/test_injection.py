@@ -33,9 +33,8 @@ def radar_plots(rng, n=20_000, **columns):
 
 
 def test_faults_are_what_was_asked_for(rng):
-    plots = radar_plots(rng)
-    plots.reason[:1000] = 1
-    plots.kind[1000:2000] = Kind.GEODETIC
+    k = np.arange(20_000)
+    plots = radar_plots(rng, reason=k < 1000, kind=np.where((k >= 1000) & (k < 2000), Kind.GEODETIC, Kind.POLAR))
     faulty = inject(plots, 0.02, np.random.default_rng(1))
     n, hit = 18_000, faulty.fault > 0
     assert not hit[:2000].any()

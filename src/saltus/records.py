@@ -120,7 +120,10 @@ def _column(dtype: npt.DTypeLike, absent: object) -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plots:
-    """Target reports of one or several sources, one array element each, all columns of one length N."""
+    """Target reports of one or several sources, one array element each, all columns of one length N.
+
+    A column of which all reports have one value, the absent one above all, is held once and may not be written to.
+    """
 
     sources: tuple[Source, ...]
     files: tuple[str, ...]
@@ -173,9 +176,9 @@ class Plots:
                 continue
             dtype, absent = f.metadata["dtype"], f.metadata["absent"]
             given = columns.get(f.name)
-            arrays[f.name] = np.full(n, absent, dtype) if given is None else np.asarray(given).astype(dtype)
-            if arrays[f.name].shape != (n,):
-                raise ValueError(f"column {f.name!r} has shape {arrays[f.name].shape}, expected ({n},)")
+            if given is not None and np.shape(given) != (n,):
+                raise ValueError(f"column {f.name!r} has shape {np.shape(given)}, expected ({n},)")
+            arrays[f.name] = _once(np.asarray([absent] * min(n, 1) if given is None else given).astype(dtype), n)
         return cls(sources, files, **arrays)
 
     def __len__(self) -> int:
@@ -184,7 +187,13 @@ class Plots:
 
     def take(self, index: npt.NDArray[np.generic] | slice) -> "Plots":
         """Return the reports selected by an index array, a mask or a slice."""
-        return replace(self, **{name: getattr(self, name)[index] for name in self.column_names()})
+        n = len(self.time[index])
+        taken: dict[str, Any] = {name: _taken(getattr(self, name), index, n) for name in self.column_names()}
+        return replace(self, **taken)
+
+    def in_file(self, name: str) -> "Plots":
+        """The same reports as those of one file."""
+        return replace(self, files=(name,), file=_once(np.zeros(len(self), np.int32), len(self)))
 
     @classmethod
     def column_names(cls) -> list[str]:
@@ -201,22 +210,48 @@ class Plots:
             source_idx = np.array([_index_of(sources, s) for s in part.sources], np.int32)
             for name in columns:
                 columns[name].append(getattr(part, name))
-            columns["source"][-1] = source_idx[part.source] if len(part) else part.source
-            columns["file"][-1] = part.file + np.int32(len(files))
+            columns["source"][-1] = _once(source_idx[part.source] if len(part) else part.source, len(part))
+            columns["file"][-1] = _once(part.file + np.int32(len(files)), len(part))
             files.extend(part.files)
         n = sum(len(p) for p in parts)
         if not parts:
             return cls.build(0, (), (), {})
-        return cls.build(n, tuple(sources), tuple(files), {k: np.concatenate(v) for k, v in columns.items()})
+        return cls(tuple(sources), tuple(files), **{name: _joined(columns.pop(name), n) for name in cls.column_names()})
 
     def sorted_by_time(self) -> "Plots":
         """Return the reports in time order (stable)."""
+        if len(self) < 2 or np.all(self.time[1:] >= self.time[:-1]):
+            return self
         return self.take(np.argsort(self.time, kind="stable"))
+
+
+def _once(values: npt.NDArray[Any], n: int) -> npt.NDArray[Any]:
+    """One value for all of `n` reports where they have no other; NaN is a value."""
+    if not n or values.strides == (0,):
+        return values
+    first = values[0]
+    other = values == values if first != first else values != first
+    return values if other.any() else np.broadcast_to(values[:1].copy(), (n,))
+
+
+def _taken(values: npt.NDArray[Any], index: npt.NDArray[np.generic] | slice, n: int) -> npt.NDArray[Any]:
+    return np.broadcast_to(values[:1], (n,)) if n and values.strides == (0,) else values[index]
+
+
+def _joined(parts: list[npt.NDArray[Any]], n: int) -> npt.NDArray[Any]:
+    """Columns of several recordings as one."""
+    some = [part for part in parts if len(part)]
+    ends = np.array([part[0] for part in some]) if some else np.zeros(0)
+    if some and len(np.unique(ends)) == 1 and all(len(part) == 1 or part.strides == (0,) for part in some):
+        return np.broadcast_to(some[0][:1], (n,))
+    return some[0] if len(some) == 1 else np.concatenate(parts)
 
 
 def _index_of(sources: list[Source], source: Source) -> int:
     for i, known in enumerate(sources):
         if known.system == source.system:
+            turns = known.traits.rotating or source.traits.rotating  # told by the reports that were seen
+            sources[i] = replace(known, traits=replace(known.traits, rotating=turns))
             return i
     sources.append(source)
     return len(sources) - 1

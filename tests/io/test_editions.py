@@ -26,7 +26,7 @@ def blocks(*some):
     n, none = len(some), np.full(len(some), np.nan)
     category = np.array([b[0] for b in some], np.uint8)
     data = np.frombuffer(b"".join(some), np.uint8)
-    return Blocks(data, offset, length, category, none, np.zeros(n, np.bool_), offset, False)
+    return Blocks(data, offset, length, category, none, np.zeros(n, np.bool_), offset, np.full(n, -1, np.int32), False)
 
 
 def test_one_record_tells_its_edition(tmp_path):
@@ -94,7 +94,7 @@ def test_none_fits_and_what_to_try(tmp_path):
     assert 'to see what there is, write 21 = "' in chosen.note
     with pytest.raises(DataError, match=r"edition '9\.9' of category 21 is not known; choose one of 0\.23"):
         choose_edition(21, blocks(other), "9.9", "a")
-    assert choose_edition(250, blocks(cat021("8001", 250)), None, "a").note == "1 blocks; no definition of it is known."
+    assert choose_edition(250, blocks(cat021("8001", 250)), None, "a").note == "no definition of it is known."
 
 
 def test_field_cases(request):

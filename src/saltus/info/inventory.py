@@ -1,12 +1,12 @@
 """What recordings hold, system by system, summed over files and pieces of files."""
 
-from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from saltus.info.figures import Figures
+from saltus.io.contents import Tally, line_key
 from saltus.records import Contents, FileContents, Kind, Plots, Recording, System
 
 __all__ = ["Inventory", "Line"]
@@ -19,15 +19,12 @@ class Line:
     contents: Contents
     figures: Figures = field(default_factory=Figures)
     needs_site: bool = False  # some reports are relative to a site that they do not tell
-    periods: list[float] = field(default_factory=list)
 
-    def add(self, contents: Contents, plots: Plots) -> None:
-        """Count what a further piece holds."""
+    def add(self, plots: Plots) -> None:
+        """Count the reports of a further piece."""
         self.figures.add(plots)
         relative = np.isin(plots.kind, (Kind.POLAR, Kind.PLANE, Kind.BEARING)) & np.isnan(plots.observer_latitude)
         self.needs_site |= bool(relative.any())
-        if np.isfinite(contents.update_period):
-            self.periods.append(contents.update_period)
 
 
 class Inventory:
@@ -38,18 +35,18 @@ class Inventory:
         self.files: dict[str, FileContents] = {}
         self.problems: dict[str, None] = {}
         self.n_reports = self.n_usable = self.n_tracks = 0
+        self._tally = Tally()
 
     def add(self, recording: Recording) -> None:
         """Count a recording, or a piece of one."""
         plots = recording.plots
         names = {name: k for k, name in enumerate(plots.files)}
         for contents in recording.contents:
-            key = contents.file, str(contents.system), contents.edition
-            line = self.lines.setdefault(key, Line(_empty(contents)))
-            line.contents = _sum(line.contents, contents)
-            line.add(contents, plots.take(_of(plots, contents.system, names.get(contents.file, -1))))
-            if line.periods:
-                line.contents = replace(line.contents, update_period=float(np.median(line.periods)))
+            line = self.lines.setdefault(line_key(contents), Line(contents))
+            line.add(plots.take(_of(plots, contents.system, names.get(contents.file, -1))))
+        self._tally.add(recording.contents)
+        for contents in self._tally.lines():
+            self.lines[line_key(contents)].contents = contents
         self.files |= {f.file: f for f in recording.files}
         self.problems |= dict.fromkeys(recording.problems)
         self.n_reports += len(plots)
@@ -65,24 +62,3 @@ def _of(plots: Plots, system: System, file: int) -> npt.NDArray[np.bool_]:
     own = [k for k, s in enumerate(plots.sources) if s.system == system]
     mine: npt.NDArray[np.bool_] = (plots.file == file) & np.isin(plots.source, own)
     return mine
-
-
-def _empty(contents: Contents) -> Contents:
-    return replace(contents, n_records=0, n_reports=0, fields={}, rejected={}, n_by_type={})
-
-
-def _sum(a: Contents, b: Contents) -> Contents:
-    """Contents of two pieces together."""
-    return replace(
-        a,
-        n_records=a.n_records + b.n_records,
-        n_reports=a.n_reports + b.n_reports,
-        time_from=float(np.fmin(a.time_from, b.time_from)),
-        time_to=float(np.fmax(a.time_to, b.time_to)),
-        fields=dict(sorted((Counter(a.fields) + Counter(b.fields)).items())) if a.titles or b.titles else b.fields,
-        rejected=dict(Counter(a.rejected) + Counter(b.rejected)),
-        n_by_type=dict(Counter(a.n_by_type) + Counter(b.n_by_type)),
-        notes=tuple(dict.fromkeys((*a.notes, *b.notes))),
-        titles={**a.titles, **b.titles},
-        site=a.site if b.site is None else b.site,
-    )

@@ -16,8 +16,6 @@ from saltus.text import brief
 
 __all__ = ["FORMATS", "Format", "ReadingSettings", "Told", "format_of", "read", "read_part"]
 
-_PER_BYTE = 30.0  # bytes that a byte of ASTERIX takes while it is read and merged, measured; see docs/formats.md
-
 Progress = Callable[[str, float], None]
 Reader = Callable[[Path, "Told", Progress | None], Part]
 
@@ -43,12 +41,15 @@ class Format(NamedTuple):
 
 def _asterix(path: Path, told: Told, progress: Progress | None) -> Part:
     from saltus.io.asterix import read_asterix
-    from saltus.io.sheet import refuse_size
 
-    size = path.stat().st_size if told.most is None else min(path.stat().st_size, told.most)
-    refuse_size(path, size * _PER_BYTE, told.settings.memory, f"{size / 1e6:.4g} MB of ASTERIX")
     return read_asterix(
-        path, date=told.date, editions=told.editions, framing=told.framing, most=told.most, progress=progress
+        path,
+        date=told.date,
+        editions=told.editions,
+        framing=told.framing,
+        most=told.most,
+        memory=told.settings.memory,
+        progress=progress,
     )
 
 

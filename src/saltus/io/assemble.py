@@ -17,62 +17,86 @@ from saltus.io.found import Found
 from saltus.io.part import Part, revisit, rotating
 from saltus.records import Contents, Kind, Plots, Source, System, Traits
 
-__all__ = ["assemble"]
+__all__ = ["Assembler"]
 
 
-def assemble(
+class Assembler:
+    """Turns the records of a recording, piece after piece, into target reports and lines of contents."""
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        """Begin a recording.
+
+        Args:
+            name: of the file.
+            clock: that dates its records.
+        """
+        self._name, self._clock = name, clock
+        self._before: Counter[int] = Counter()  # records of each category in the pieces before
+        self._doubted = False  # the clock of the capture was found to be another
+
+    def part(self, found: Mapping[int, Found], notes: Mapping[int, tuple[str, ...]], *, dated: bool) -> Part:
+        """Take the next piece.
+
+        Args:
+            found: records by category.
+            notes: on each category.
+            dated: the clocks of all blocks tell the date.
+        """
+        name, clock = self._name, self._clock
+        read = {number: read_records(number, records) for number, records in found.items() if len(records)}
+        times = clock.times(read, dated=dated)
+        problems: list[str] = []
+        if clock.captured and read and not self._doubted:
+            captured = np.concatenate([r.found.clock for r in read.values()])
+            told = told_clock(captured, np.concatenate(list(times.values())))
+            problems += [f"{name}: {told}"] if told else []
+            self._doubted = bool(told)
+        plots, tracks, contents = [], [], []
+        turns = _turns(read, times)
+        for number, r in read.items():
+            part = _plots(name, CATEGORIES[number].traits, r, times[number], self._before[number])
+            self._before[number] += len(r.found)
+            plots.append(part)
+            if r.decoded.tracks is not None:
+                tracks.append(_tracks(r, r.decoded.tracks, times[number]))
+            contents += _lines(name, number, r, times[number], part, turns, notes[number])
+        with_reports = [p for p in plots if len(p)] or plots[:1]
+        return Part(
+            Plots.concat(with_reports).in_file(name),
+            pa.concat_tables(tracks) if tracks else None,
+            tuple(contents),
+            tuple(problems),
+            in_order=True,
+            dated=clock.captured,
+        )
+
+
+def _lines(
     name: str,
-    found: Mapping[int, Found],
-    notes: Mapping[int, tuple[str, ...]],
-    clock: Clock,
-    *,
-    dated: bool,
-) -> Part:
-    """Turn the records of a recording, or of its next piece, into target reports and lines of contents.
-
-    Args:
-        name: of the file.
-        found: records by category.
-        notes: on each category.
-        clock: that goes on from piece to piece.
-        dated: the clocks of all blocks tell the date.
-    """
-    read = {number: read_records(number, records) for number, records in found.items() if len(records)}
-    problems: list[str] = []
-    times = clock.times(read, dated=dated)
-    if clock.captured(dated=dated):
-        told = told_clock(*(np.concatenate(c) for c in ([r.found.clock for r in read.values()], list(times.values()))))
-        problems += [f"{name}: {told}"] if told else []
-    plots, tracks, contents = [], [], []
-    turns = _turns(read, times)
-    for number, r in read.items():
-        part = _plots(name, CATEGORIES[number].traits, r, times[number])
-        plots.append(part)
-        if r.decoded.tracks is not None:
-            tracks.append(_tracks(r, r.decoded.tracks, times[number]))
-        sets, which = announced(r.found.data, r.found.records, r.found.layout)
-        for k, system in enumerate(r.systems):
-            mine = r.system_of == k
-            fields: Counter[str] = Counter()
-            for items, n in zip(sets, np.bincount(which[mine], minlength=len(sets)).tolist(), strict=True):
-                fields.update({f"I{number:03d}/{item}": n for item in items if n})
-            line = _contents(name, system, r, times[number], mine, part, turns)
-            extra = ("counted only: no target reports are taken from this category",)
-            said = (*notes[number], *(extra if CATEGORIES[number].counted else ()))
-            titles = {name: r.found.layout.titles.get(name[5:], "") for name in fields}
-            contents.append(replace(line, fields=dict(sorted(fields.items())), notes=said, titles=titles))
-    with_reports = [p for p in plots if len(p)] or plots[:1]
-    return Part(
-        _one_file(Plots.concat(with_reports), name),
-        pa.concat_tables(tracks) if tracks else None,
-        tuple(contents),
-        tuple(problems),
-        in_order=True,
-        dated=clock.captured(dated=dated),
-    )
+    number: int,
+    r: Read,
+    time: npt.NDArray[np.float64],
+    plots: Plots,
+    turns: Mapping[System, float],
+    notes: tuple[str, ...],
+) -> list[Contents]:
+    """A line of contents for each system of a category."""
+    lines = []
+    sets, which = announced(r.found.data, r.found.records, r.found.layout)
+    for k, system in enumerate(r.systems):
+        mine = r.system_of == k
+        fields: Counter[str] = Counter()
+        for items, n in zip(sets, np.bincount(which[mine], minlength=len(sets)).tolist(), strict=True):
+            fields.update({f"I{number:03d}/{item}": n for item in items if n})
+        line = _contents(name, system, r, time, mine, plots, turns)
+        extra = ("counted only: no target reports are taken from this category",)
+        said = (*notes, *(extra if CATEGORIES[number].counted else ()))
+        titles = {item: r.found.layout.titles.get(item[5:], "") for item in fields}
+        lines.append(replace(line, fields=dict(sorted(fields.items())), notes=said, titles=titles))
+    return lines
 
 
-def _plots(name: str, traits: Traits, r: Read, time: npt.NDArray[np.float64]) -> Plots:
+def _plots(name: str, traits: Traits, r: Read, time: npt.NDArray[np.float64], before: int) -> Plots:
     kinds = np.asarray(r.decoded.columns.get("kind", np.full(len(time), Kind.NONE)))
     sources = tuple(
         Source(s, rotating(traits, kinds[r.system_of == k]), **r.decoded.steps) for k, s in enumerate(r.systems)
@@ -82,7 +106,7 @@ def _plots(name: str, traits: Traits, r: Read, time: npt.NDArray[np.float64]) ->
         "time": time,
         "source": r.system_of,
         "file": np.zeros(len(time)),
-        "record": np.arange(len(time)),
+        "record": before + np.arange(len(time)),
     }
     return Plots.build(len(time), sources, (name,), columns).take(np.flatnonzero(r.decoded.is_report))
 
@@ -91,11 +115,6 @@ def _tracks(r: Read, table: pa.Table, time: npt.NDArray[np.float64]) -> pa.Table
     labels = pa.array([str(system) for system in r.systems]).take(pa.array(r.system_of))
     table = table.add_column(0, "system", labels).add_column(1, "time", pa.array(time))
     return table.filter(pa.array(r.decoded.is_report))
-
-
-def _one_file(plots: Plots, name: str) -> Plots:
-    """Categories were joined as if they were files: make them one again."""
-    return replace(plots, files=(name,), file=np.zeros(len(plots), np.int32))
 
 
 def _turns(read: Mapping[int, Read], times: Mapping[int, npt.NDArray[np.float64]]) -> dict[System, float]:

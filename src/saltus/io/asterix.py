@@ -17,16 +17,18 @@ import numpy as np
 from saltus.errors import DataError
 from saltus.framing import Told
 from saltus.framing.told import framing_words
-from saltus.io.assemble import assemble
+from saltus.io.assemble import Assembler
 from saltus.io.blocks import Blocks
 from saltus.io.dating import Clock
 from saltus.io.found import Found
-from saltus.io.part import Part
+from saltus.io.part import Part, join_parts
+from saltus.io.sheet import refuse_size
 from saltus.io.stream import Stream
 from saltus.records import Contents, FileContents, Plots, System
 
 __all__ = ["read_asterix", "read_pieces"]
 
+PER_REPORT = 250.0  # bytes that a report takes until it is merged, measured; see docs/formats.md
 _TOLD = 8  # problems of one kind told one by one
 
 
@@ -37,9 +39,10 @@ def read_asterix(
     editions: Mapping[int, str],
     framing: str | None = None,
     most: int | None = None,
+    memory: float = np.inf,
     progress: Callable[[str, float], None] | None = None,
 ) -> Part:
-    """Read one recording.
+    """Read one recording: its reports are held, its bytes and items a piece at a time.
 
     Args:
         path: the file.
@@ -47,20 +50,23 @@ def read_asterix(
         editions: category -> edition; categories not named are guessed.
         framing: one of `saltus.framing.NAMES`; None has it guessed.
         most: bytes read, from the beginning; None = all.
+        memory: bytes that its reports may take until they are merged.
         progress: called with the file's name and the fraction read.
 
     Raises:
-        DataError: the file is empty, holds no record, or an edition does not exist or is plainly not the file's.
+        DataError: the file is empty, holds no record, or too many reports, or an edition does not exist or is plainly
+            not the file's.
     """
-    *some, last = read_pieces(
-        path, date=date, editions=editions, framing=framing, most=most, whole=True, progress=progress
-    )
-    if not some:
-        return last
-    (part,) = some
-    return part._replace(
-        contents=(*part.contents, *last.contents), problems=(*last.problems, *part.problems), file=last.file
-    )
+    stream = Stream(path, editions, framing)
+    parts: list[Part] = []
+    n = 0
+    for part in _pieces(stream, date, most, progress):
+        n += len(part.plots)
+        refuse_size(path, n * PER_REPORT, memory, f"more than {n} reports")
+        parts.append(part)
+    if stream.changed:  # now that all is known of its editions
+        parts = list(_pieces(Stream(path, editions, framing, stream.chosen), date, most, progress))
+    return join_parts(parts)
 
 
 def read_pieces(
@@ -70,7 +76,6 @@ def read_pieces(
     editions: Mapping[int, str],
     framing: str | None = None,
     most: int | None = None,
-    whole: bool = False,
     progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[Part]:
     """Read one recording as `read_asterix` does, a piece at a time: memory does not grow with it.
@@ -78,44 +83,51 @@ def read_pieces(
     Args:
         path: the file.
         date: of the first record; None = by the capture clock, else 1970-01-01.
-        editions: category -> edition; categories not named are guessed where they occur first.
+        editions: category -> edition; categories not named are guessed by the blocks that come first.
         framing: one of `saltus.framing.NAMES`; None has it guessed.
         most: bytes read, from the beginning; None = all.
-        whole: the file is one piece.
         progress: called with the file's name and the fraction read.
 
     Yields:
         Pieces with records, and last a part without reports: what could not be read, and how the file is framed.
     """
-    name = path.name
+    return _pieces(Stream(path, editions, framing), date, most, progress)
+
+
+def _pieces(
+    stream: Stream,
+    date: datetime.date | None,
+    most: int | None,
+    progress: Callable[[str, float], None] | None,
+) -> Iterator[Part]:
+    path, name = stream.path, stream.path.name
     if not path.stat().st_size:
         raise DataError(f"{path}: byte 0: the file is empty.")
-    stream, clock, broken = Stream(path, editions, framing), Clock(date, name), _Broken(name)
+    clock, broken = Clock(date, name), _Broken(name)
+    assembler = Assembler(name, clock)
     first: dict[int, int] = {}  # byte of the first block of each category
-    empty, dated = True, True
-    for piece in stream.pieces(whole=whole, most=most, progress=progress):
+    empty = True
+    for piece in stream.pieces(most=most, progress=progress):
         for number, (blocks, _) in piece.items():
             first.setdefault(number, int(blocks.at[0]))
         found = stream.records(piece)
         for number, held in found.items():
             broken.add(piece[number][0], held)
-        of_piece = all(blocks.dated for blocks, _ in piece.values())
-        dated &= of_piece
         if any(len(f) for f in found.values()):
             empty = False
             notes = {n: (c.note,) if c.note else () for n, c in stream.chosen.items()}
-            yield assemble(name, found, notes, clock, dated=of_piece)
-    unread = {n: c.note for n, c in sorted(stream.chosen.items()) if not c.edition}
+            yield assembler.part(found, notes, dated=all(blocks.dated for blocks, _ in piece.values()))
+    unread = {n: f"{stream.n_blocks[n]} blocks; {c.note}" for n, c in sorted(stream.chosen.items()) if not c.edition}
     problems = _problems(name, stream, unread, first, broken)
-    if not empty and date is None and not dated:
+    if not empty and clock.dateless:
         problems.append(f"{name}: no date given: times count from 1970-01-01; give --date YYYY-MM-DD.")
     if empty and not unread:
         said = f" {problems[0]}" if problems else ""
         raise DataError(f"{path}: no ASTERIX record could be read: wrong format, category or edition?{said}")
     lines = tuple(_unread(name, number, note) for number, note in unread.items())
-    problems += dict.fromkeys(clock.problems)
+    problems += clock.problems
     about = _about(path, stream.told, most)
-    yield Part(Plots.build(0, (), (name,), {}), None, lines, tuple(problems), True, dated, about)
+    yield Part(Plots.build(0, (), (name,), {}), None, lines, tuple(problems), True, clock.captured, about)
 
 
 class _Broken:

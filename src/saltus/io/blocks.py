@@ -27,6 +27,7 @@ class Blocks:
     clock: npt.NDArray[np.float64]
     cut: npt.NDArray[np.bool_]
     at: npt.NDArray[np.int64]
+    channel: npt.NDArray[np.int32]
     dated: bool  # every clock tells the date
 
     def __len__(self) -> int:
@@ -35,26 +36,39 @@ class Blocks:
 
     def take(self, index: npt.NDArray[np.generic]) -> "Blocks":
         """Select blocks by index or mask."""
-        names = ("offset", "length", "category", "clock", "cut", "at")
+        names = ("offset", "length", "category", "clock", "cut", "at", "channel")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
+    def copied(self) -> "Blocks":
+        """The same blocks over a buffer that holds no others."""
+        bodies = [self.data[o : o + n] for o, n in zip(self.offset.tolist(), self.length.tolist(), strict=True)]
+        start = np.cumsum(self.length) - self.length
+        return replace(self, data=np.concatenate(bodies) if bodies else self.data[:0], offset=start)
 
-def joined(chunks: Sequence[Chunk]) -> Blocks:
+
+def joined(chunks: Sequence["Chunk | Blocks"]) -> Blocks:
     """The blocks of all chunks over one buffer."""
-    start = np.cumsum([0, *(len(c.data) for c in chunks)])
+    buffers: list[npt.NDArray[np.uint8]] = []
+    start, end = [], 0  # where the buffer of each chunk begins in that of all, and where the last ends
+    for chunk in chunks:
+        if not buffers or buffers[-1] is not chunk.data:
+            buffers.append(chunk.data)
+            end += len(chunk.data)
+        start.append(end - len(chunk.data))
 
     def column(name: str) -> npt.NDArray[np.generic]:
         return np.concatenate([getattr(c, name) for c in chunks]) if chunks else np.zeros(0)
 
-    offset = [c.offset + s for c, s in zip(chunks, start[:-1], strict=True)]
+    offset = [c.offset + s for c, s in zip(chunks, start, strict=True)]
     return Blocks(
-        chunks[0].data if len(chunks) == 1 else np.concatenate([c.data for c in chunks] or [np.zeros(0, np.uint8)]),
+        buffers[0] if len(buffers) == 1 else np.concatenate(buffers or [np.zeros(0, np.uint8)]),
         np.concatenate(offset) if offset else np.zeros(0, np.int64),
         column("length").astype(np.int64),
         column("category").astype(np.uint8),
         column("clock").astype(np.float64),
         column("cut").astype(np.bool_),
         column("at").astype(np.int64),
+        column("channel").astype(np.int32),
         bool(chunks) and all(c.dated for c in chunks),
     )
 

@@ -79,9 +79,10 @@ def standing(time: Float[np.ndarray, " n"], identity: Int[np.ndarray, " n"]) -> 
     """
     stands = np.zeros(len(time), np.bool_)
     edges = np.flatnonzero(np.diff(time, prepend=np.nan, append=np.nan) != 0)
-    for start, stop in pairwise(edges.tolist()):
+    long = np.flatnonzero(np.diff(edges) >= _RUN)
+    for start, stop in zip(edges[long].tolist(), edges[long + 1].tolist(), strict=True):
         known = start + np.flatnonzero(identity[start:stop] >= 0)
-        if stop - start < _RUN or not len(known):
+        if not len(known):
             continue
         first = np.unique(identity[known], return_index=True)[1]
         if len(known) - len(first) > _AGAIN * len(known):

@@ -1,8 +1,9 @@
 """Records of a recording, piece after piece, to times: midnights counted, truncated times completed."""
 
 import datetime
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -50,23 +51,40 @@ def _possible(decoded: Decoded) -> Decoded:
 
 
 class Clock:
-    """Times of records, s, UTC, from times of day: midnights are counted from piece to piece."""
+    """Times of records, s, UTC, from times of day, piece after piece of a recording.
+
+    Midnights are counted from piece to piece, and the times of service messages complete those of the next piece.
+    """
 
     def __init__(self, date: datetime.date | None, name: str) -> None:
         """Begin on a day; without one, clocks of captures tell it, else 1970-01-01 is the first."""
-        self._date = date
         self._first = ((date or datetime.date(1970, 1, 1)) - datetime.date(1970, 1, 1)).days
         self._name = name
+        self._given = date is not None
         self._tail = np.zeros(0)  # the last times of day, and
         self._days = np.zeros(0, np.int64)  # their days
-        self.problems: list[str] = []
+        self._services: dict[System, float] = {}  # the last time of day of each source of service messages
+        self._started = False
+        self.captured = False  # the clock of a capture told the days of the last piece
+        self.dateless = False  # days count from 1970-01-01
+        self._lost: Counter[tuple[int, float]] = (
+            Counter()
+        )  # records by category and modulus whose time nothing completes
 
-    def captured(self, *, dated: bool) -> bool:
-        """Whether the clock of a capture tells the days: where it does and no date was given."""
-        return dated and self._date is None
+    @property
+    def problems(self) -> list[str]:
+        """What could not be dated."""
+        return [
+            f"{self._name}: {n} records of category {number} tell their time modulo {modulus:g} s only, and neither a "
+            f"message of category {CATEGORIES[number].turns} of their source nor a capture clock completes it: they "
+            "have no time. Record the service messages too, or capture packets."
+            for (number, modulus), n in self._lost.items()
+        ]
 
     def times(self, read: Mapping[int, Read], *, dated: bool) -> dict[int, npt.NDArray[np.float64]]:
         """Times of the records of a recording or its next piece, by category.
+
+        The clock of a capture tells the days where no date is given, unless the recording began without one.
 
         Args:
             read: the records.
@@ -74,15 +92,41 @@ class Clock:
         """
         if not read:
             return {}
-        tod = np.concatenate([_time_of_day(number, read, self._name, self.problems) for number in read])
-        if self.captured(dated=dated):
+        if not self._started:
+            self._started, self.dateless = True, not (self._given or dated)
+        self.captured = dated and not self._given and not self.dateless
+        tod = np.concatenate([self._time_of_day(number, read) for number in read])
+        sequence = np.concatenate([r.found.sequence for r in read.values()])
+        if self.captured:
             clock = np.concatenate([r.found.clock for r in read.values()])
             days = np.round((clock - tod) / DAY)
-            time = tod + DAY * np.where(np.isnan(days), np.nanmedian(days) if np.isfinite(days).any() else 0.0, days)
+            usual = np.nanmedian(days) if np.isfinite(days).any() else (self._first + np.append(self._days, 0)[0])
+            days = np.where(np.isnan(days), usual, days)
+            self._remember(tod, days.astype(np.int64) - self._first, sequence)
+            time = tod + DAY * days
         else:
-            time = self._counted(tod, np.concatenate([r.found.sequence for r in read.values()]))
+            time = self._counted(tod, sequence)
+        for r in read.values():
+            self._hear(r)
         bounds = np.cumsum([0] + [len(r.found) for r in read.values()])
         return {n: time[a:b] for n, a, b in zip(read, bounds[:-1], bounds[1:], strict=True)}
+
+    def _remember(
+        self, tod: npt.NDArray[np.float64], days: npt.NDArray[np.int64], sequence: npt.NDArray[np.int64]
+    ) -> None:
+        """Keep the last times of day and their days."""
+        order = np.argsort(sequence, kind="stable")
+        valid = order[np.isfinite(tod[order])][-_TAIL:]
+        if len(valid):
+            self._tail, self._days = tod[valid], days[valid]
+
+    def _hear(self, r: Read) -> None:
+        """Keep the last time of day of each source, where others complete theirs by it."""
+        if any(c.turns == r.found.layout.category for c in CATEGORIES.values()):
+            for k, system in enumerate(r.systems):
+                told = np.flatnonzero((r.system_of == k) & np.isfinite(r.decoded.time_of_day))
+                if len(told):
+                    self._services[system] = float(r.decoded.time_of_day[told[np.argmax(r.found.sequence[told])]])
 
     def _counted(self, tod: npt.NDArray[np.float64], sequence: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         order = np.argsort(sequence, kind="stable")
@@ -91,42 +135,40 @@ class Clock:
         known = len(self._tail)
         if known:
             days = days + int(np.median(self._days - days[:known]))
-        counted = np.empty(len(tod))
+        counted = np.empty(len(tod), np.int64)
         counted[order] = days[known:]
         valid = np.flatnonzero(np.isfinite(joined_tod))[-_TAIL:]
         self._tail, self._days = joined_tod[valid], days[valid]
         return tod + DAY * (counted + self._first)
 
+    def _time_of_day(self, number: int, read: Mapping[int, Read]) -> npt.NDArray[np.float64]:
+        """Times of day of a category; truncated ones are completed, or become NaN, and are counted."""
+        r = read[number]
+        modulus = r.decoded.time_modulus
+        if not modulus:
+            return r.decoded.time_of_day
+        time = complete(r.decoded.time_of_day, modulus, self._reference(number, read))
+        lost = int(np.count_nonzero(np.isnan(time) & ~np.isnan(r.decoded.time_of_day)))
+        if lost:
+            self._lost[number, modulus] += lost
+        return time
 
-def _time_of_day(number: int, read: Mapping[int, Read], name: str, problems: list[str]) -> npt.NDArray[np.float64]:
-    """Times of day of a category's records; truncated ones are completed, or become NaN, and a problem says so."""
-    r = read[number]
-    modulus = r.decoded.time_modulus
-    if not modulus:
-        return r.decoded.time_of_day
-    time = complete(r.decoded.time_of_day, modulus, _reference(number, read))
-    lost = np.count_nonzero(np.isnan(time) & ~np.isnan(r.decoded.time_of_day))
-    if lost:
-        problems.append(
-            f"{name}: {lost} records of category {number} tell their time modulo {modulus:g} s only, and neither a "
-            f"message of category {CATEGORIES[number].turns} of their source nor a capture clock completes it: they "
-            "have no time. Record the service messages too, or capture packets."
-        )
-    return time
-
-
-def _reference(number: int, read: Mapping[int, Read]) -> npt.NDArray[np.float64]:
-    """A time of day near each record: the last of its source's service messages, else the next, else its capture."""
-    r = read[number]
-    near = r.found.clock % DAY
-    service = read.get(CATEGORIES[number].turns or 0)
-    if service is None:
+    def _reference(self, number: int, read: Mapping[int, Read]) -> npt.NDArray[np.float64]:
+        """A time of day near each record: that of its source's last service message, else the next, else captured."""
+        r, turns = read[number], CATEGORIES[number].turns
+        near = r.found.clock % DAY
+        service = read.get(turns or 0)
+        for k, system in enumerate(r.systems):
+            mine, own = r.system_of == k, replace(system, category=turns)
+            before = self._services.get(own, np.nan)
+            near[mine] = np.where(np.isnan(before), near[mine], before)
+            if service is None or own not in service.systems:
+                continue
+            told = (service.system_of == service.systems.index(own)) & np.isfinite(service.decoded.time_of_day)
+            if told.any():
+                last = np.searchsorted(service.found.sequence[told], r.found.sequence[mine]) - 1
+                first = np.nan if np.isfinite(before) else service.decoded.time_of_day[told][0]
+                given = service.decoded.time_of_day[told][np.maximum(last, 0)]
+                given = np.where(last < 0, first, given)
+                near[mine] = np.where(np.isnan(given), near[mine], given)
         return near
-    for k, system in enumerate(r.systems):
-        said = [j for j, s in enumerate(service.systems) if (s.sac, s.sic) == (system.sac, system.sic)]
-        told = np.isin(service.system_of, said) & np.isfinite(service.decoded.time_of_day)
-        if told.any():
-            mine = r.system_of == k
-            last = np.searchsorted(service.found.sequence[told], r.found.sequence[mine]) - 1
-            near[mine] = service.decoded.time_of_day[told][np.maximum(last, 0)]
-    return near

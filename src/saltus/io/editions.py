@@ -12,9 +12,9 @@ from saltus.errors import DataError
 from saltus.io.blocks import Blocks
 from saltus.io.sense import evidence
 
-__all__ = ["Chosen", "Weighed", "choose_edition", "weigh"]
+__all__ = ["SAMPLE", "Chosen", "Weighed", "choose_edition", "weigh"]
 
-_SAMPLE = 200  # blocks looked at
+SAMPLE = 200  # blocks looked at
 _FITS, _ENOUGH = 0.5, 20  # an edition that explains less of this many blocks is not theirs
 _SURELY = 0.9  # an edition that explains as much is theirs, where the one asked for is not
 _FOLLOWS, _LUCK = 0.97, 0.3  # blocks that follow their own edition, and another one
@@ -57,20 +57,20 @@ def choose_edition(number: int, blocks: Blocks, asked: str | None, name: str) ->
     """
     known = editions(number)
     if not known:
-        return Chosen("", f"{len(blocks)} blocks; no definition of it is known.", ())
+        return Chosen("", "no definition of it is known.", ())
     if asked is not None and asked not in known:
         raise DataError(
             f"edition {asked!r} of category {number} is not known; choose one of {', '.join(known)} in [editions]."
         )
     whole = np.flatnonzero(~blocks.cut) if not blocks.cut.all() else np.arange(len(blocks))
-    sample = blocks.take(whole[:: max(1, len(whole) // _SAMPLE)][:_SAMPLE])
+    sample = blocks.take(whole[:: max(1, len(whole) // SAMPLE)][:SAMPLE])
     weighed = tuple(weigh(number, edition, sample) for edition in reversed(known))
     best = max(weighed, key=lambda w: (w.nats, w.edition == _COMMONEST.get(number)))  # the newest of equals
     if asked is not None:
         _check_asked(number, next(w for w in weighed if w.edition == asked), best, len(sample), name)
         return Chosen(asked, "", weighed)
     if (best.share < _FITS or best.nats < 0.0) and len(sample) >= _ENOUGH:
-        return Chosen("", _none_fits(number, len(blocks), weighed), weighed)
+        return Chosen("", _none_fits(number, weighed), weighed)
     alike = [w for w in weighed if w.nats == best.nats]
     if len(alike) == len(known):
         return Chosen(best.edition, "", weighed)
@@ -107,11 +107,11 @@ def _check_asked(number: int, asked: Weighed, best: Weighed, n: int, name: str) 
         )
 
 
-def _none_fits(number: int, n: int, weighed: Sequence[Weighed]) -> str:
+def _none_fits(number: int, weighed: Sequence[Weighed]) -> str:
     best = max(weighed, key=lambda w: w.share)
     names = ", ".join(w.edition for w in reversed(weighed))
     return (
-        f"{n} blocks; none of the editions {names} explains more than {best.share:.0%} of their bytes, of whose values "
+        f"none of the editions {names} explains more than {best.share:.0%} of their bytes, of whose values "
         f"{best.sense:.0%} make sense. If it is another edition, it cannot be read; to see what there is, write "
         f'{number} = "{best.edition}" in [editions].'
     )

@@ -102,15 +102,24 @@ def _outside(plots: Plots, name: str) -> npt.NDArray[np.bool_]:
 
 def _repeats(plots: Plots, reason: npt.NDArray[np.int8]) -> npt.NDArray[np.bool_]:
     """Tell the reports that repeat an earlier one of the same reason to the bit."""
-    words = [plots.source.astype(np.int64), plots.kind.astype(np.int64), reason.astype(np.int64)]
-    words += [plots.icao24.astype(np.int64), plots.time.view(np.int64)]
-    for names in zip(*_POSITION.values(), strict=True):  # the coordinates of the report's own kind
-        kinds = [plots.kind == kind for kind in _POSITION]
-        words.append(np.select(kinds, [getattr(plots, n).view(np.int64) for n in names]))
-    order = np.lexsort(words[::-1])  # stable: earlier reports first
-    table = np.stack(words)[:, order]
     again = np.zeros(len(plots), np.bool_)
-    again[order[1:]] = np.all(table[:, 1:] == table[:, :-1], axis=0)
+    if not len(plots):
+        return again
+    order = np.argsort(plots.time.view(np.int64), kind="stable")  # equal times side by side
+    same = np.diff(plots.time.view(np.int64)[order]) == 0
+    rows = np.sort(order[np.append(same, False) | np.append(False, same)])
+    del order
+    some = plots.take(rows)
+    words = [some.source.astype(np.int64), some.kind.astype(np.int64), reason[rows].astype(np.int64)]
+    words += [some.icao24.astype(np.int64), some.time.view(np.int64)]
+    for names in zip(*_POSITION.values(), strict=True):  # the coordinates of the report's own kind
+        kinds = [some.kind == kind for kind in _POSITION]
+        words.append(np.select(kinds, [getattr(some, n).view(np.int64) for n in names]))
+    order = np.lexsort(words[::-1])  # stable: earlier reports first
+    equal = np.ones(max(len(rows) - 1, 0), np.bool_)
+    for word in words:
+        equal &= np.diff(word[order]) == 0
+    again[rows[order[1:][equal]]] = True
     return again
 
 

@@ -1,5 +1,6 @@
 """What a reader makes of one file, before files are merged."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -7,11 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from saltus.io.contents import Tally
 from saltus.records import Contents, FileContents, Kind, Plots, System, Traits
 from saltus.shapes import Int
 from saltus.text import shown
 
-__all__ = ["Part", "printable", "revisit", "rotating", "scan_period"]
+__all__ = ["Part", "join_parts", "printable", "revisit", "rotating", "scan_period"]
 
 _FEW = 5  # intervals that make a median
 _NEARLY, _MOSTLY = 0.2, 0.8  # this share of the intervals lies within that of their median: one report a scan
@@ -29,6 +31,25 @@ class Part(NamedTuple):
     in_order: bool  # the order of the reports is the order of reception (not so in tables)
     dated: bool  # the file tells the date itself
     file: FileContents | None = None
+
+
+def join_parts(parts: Sequence[Part]) -> Part:
+    """Make one of the pieces of one file; what the last tells of the file goes first."""
+    name = next(name for part in parts for name in part.plots.files)
+    tables = [part.tracks for part in parts if part.tracks is not None]
+    tally = Tally()
+    for part in parts:
+        tally.add(part.contents)
+    last = parts[-1]
+    return Part(
+        Plots.concat([part.plots for part in parts]).in_file(name),
+        pa.concat_tables(tables) if tables else None,
+        tally.lines(),
+        tuple(dict.fromkeys(problem for part in (last, *parts[:-1]) for problem in part.problems)),
+        last.in_order,
+        last.dated,
+        last.file,
+    )
 
 
 def rotating(traits: Traits, kind: npt.NDArray[np.integer]) -> Traits:
