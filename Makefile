@@ -38,9 +38,12 @@ docs: $(DOCS_READY)
 	$(BIN)/python -m sphinx -W -q -b html docs build/docs
 	@echo "docs: build/docs/index.html"
 
-# The wheel is built from the sdist, so a file missing there is noticed.
-wheel: $(READY)
-	$(BIN)/python -m build --outdir dist
+# The wheel is built from the sdist, so a file missing there is noticed; for machines that are not known, with every
+# instruction set. Its tools live in an environment of their own: .venv would compile the kernel once more.
+wheel:
+	$(PYTHON) -m venv build/wheel
+	build/wheel/bin/python -m pip install -q --upgrade pip build==1.6.1
+	SALTUS_ISAS=all build/wheel/bin/python -m build --outdir dist
 
 # The peers that the benchmark compares with live in their own environment.
 bench:
@@ -80,10 +83,15 @@ fuzz: $(READY)
 	  build/fuzz/venv/bin/python tests/fuzz/long.py --guided --seconds $(FUZZ_SECONDS) --target $$target || exit 1; \
 	done
 
+# Where there is a C++20 compiler the kernel must compile; where there is none, that is said and the package works.
 $(READY): pyproject.toml $(NATIVE)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -q --upgrade pip
-	$(BIN)/python -m pip install -q -e '.[dev]'
+	@native="$${SALTUS_REQUIRE_NATIVE:-$$(sh scripts/cxx20)}"; \
+	SALTUS_REQUIRE_NATIVE="$$native" $(BIN)/python -m pip install -q -e '.[dev]' || { \
+	  [ "$$native" = 0 ] || echo "saltus: NOT INSTALLED: the compiled kernel was not built, see above." \
+	    "SALTUS_REQUIRE_NATIVE=0 make ... goes on without it: filters run in NumPy, slower." >&2; exit 1; }
+	@$(BIN)/python -c 'import importlib.util as u, sys; u.find_spec("saltus._native") or print("saltus: installed WITHOUT its compiled kernel: filters run in NumPy and recordings are read in Python, many times slower.\nInstall a C++20 compiler (g++ 11 or clang++ 14), touch pyproject.toml and make again.", file=sys.stderr)'
 	@touch $@
 
 # Only what the extra names: saltus itself is installed, and installing it again would compile it again.

@@ -98,16 +98,21 @@ EIGHT_MODES = product("8 modes (2x2x2), n=5, m=3", (2, 2, 2), 5, 3)
 
 
 def multiply_adds(w: Workload) -> float:
-    """Floating-point operations of one track-step of the kernel with keep="last", counted from native/step.hpp.
+    """Floating-point operations of one track-step with keep="last", counted from native/step.hpp and measure.hpp.
 
     A fused multiply-add counts two; exponentials and divisions count as the polynomial's operations and one.
     """
     n, m, modes = w.n, w.m, int(np.prod(w.sizes))
-    tri, trim = n * (n + 1) // 2, m * (m + 1) // 2
-    propagate = 2 * n * n + (2 * n - 1) * n * n + 2 * n * tri
-    innovation = (2 * n - 1) * n * m + 2 * n * trim + m * (2 * n + 1) + m * (m + 1) * (m + 2) // 3 + 4 * m
-    gain = n * (2 * m * (m - 1) + 3 * m) + 2 * n * n * m
-    joseph = n * m * (2 * n - 1 + 2 * m) + 2 * m * tri
+    tri, wide = n * (n + 1) // 2, n + m
+    factor = n * (n - 1) // 2 + (n - 1) * n * (n + 1) // 3 + 2 * n
+    propagate = factor + 2 * n * n + n * n * (n - 1) + n * n + 2 * tri * n + tri
+    rows = [n + a + 1 for a in range(m)]  # of y: what may differ from zero
+    innovation = m * (2 * n + 1) + m * n * (n - 1) + sum(rows[a] + 2 * sum(rows[: a + 1]) for a in range(m))
+    sweep = sum(3 * rows[a] for a in range(1, m)) + 9 * m
+    for a in range(m):
+        sweep += (m - 1 - a) * (4 * rows[a] + 3)  # the components after it
+        sweep += sum(2 * (n + a if a else i + 1) + 2 * rows[a] + 3 for i in range(n))  # the state
+    measure = factor + innovation + sweep + n * wide + 2 * tri * wide
     law = 45
     mixing = 0.0
     for size in w.sizes:
@@ -115,4 +120,4 @@ def multiply_adds(w: Workload) -> float:
             mixing += modes / 2 * (11 * tri + 7 * n + 22)
         else:
             mixing += modes * size * (2 * n + 2 * n + 4 * tri + 5)
-    return modes * (propagate + innovation + gain + joseph + law) + mixing
+    return modes * (propagate + measure + law) + mixing

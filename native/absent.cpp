@@ -2,8 +2,10 @@
 #include "kernel.hpp"
 
 namespace saltus {
-#ifndef SALTUS_X86
+#ifndef SALTUS_AVX2
 const Kernel* const kAvx2 = nullptr;
+#endif
+#ifndef SALTUS_AVX512
 const Kernel* const kAvx512 = nullptr;
 #endif
 }  // namespace saltus

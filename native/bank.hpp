@@ -62,11 +62,14 @@ inline ByMode<V> staged(const Model& model, Size first, Size count, V*& free) {
   return {model.data ? data : nullptr, model.which, model.core};
 }
 
-inline void step_rows(const Tracks& t, Rows rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
+inline int step_rows(const Tracks& t, Rows rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
                       Arena arena) {
   V *copy, *law, *heap;
   V* models = arena.base + bank_space(t, 1, arena, &copy, &law, &heap);
   const Stages steps = stages(t.n, 1);
+  bool bad = doubtful_rows(F, rows.count, 0, models, heap) || doubtful_rows(b, rows.count, 0, models, heap);
+  for (int c = 0; c < t.chains; ++c) bad = bad || doubtful_rows(trans[c], rows.count, 0, models, heap);
+  if (bad || doubtful_rows(Q, rows.count, t.n, models, heap)) return kDoubtful;
   for (Size first = 0; first < rows.count; first += W) {
     const Group group(t, rows, first, copy);
     V* state = group.belief + t.modes;
@@ -85,6 +88,7 @@ inline void step_rows(const Tracks& t, Rows rows, const Model* trans, const Mode
     for (int j = 0; j < t.modes; ++j) group.belief[j] = law[j];
     group.write_back();
   }
+  return kFine;
 }
 
 // Keep the first fault of the lanes given up of a group that begins with row `first`.
@@ -103,6 +107,9 @@ inline Fault measure_rows(const Tracks& t, Rows rows, bool write, int m, const d
   V *report = arena.take(std::size_t(t.modes) * report_size(m)), *value = arena.take(m), *on = arena.take(m);
   V* models = arena.base + arena.used;
   const Stages steps = stages(t.n, m);
+  if (doubtful_rows(H, rows.count, 0, models, heap) || doubtful_rows(d, rows.count, 0, models, heap) ||
+      doubtful_rows(R, rows.count, m, models, heap))
+    return {kDoubtful, 0, 0};
   Fault fault{};
   for (Size first = 0; first < rows.count; first += W) {
     const Group group(t, rows, first, copy);
@@ -117,8 +124,8 @@ inline Fault measure_rows(const Tracks& t, Rows rows, bool write, int m, const d
     V* free = models;
     const ByMode<V> h = staged(H, first, rows.count, free), o = staged(d, first, rows.count, free);
     const ByMode<V> r = staged(R, first, rows.count, free);
-    const I bad = (write ? steps.lanes.update : steps.lanes.score)(group.belief + t.modes, t.n, m, t.modes, h, o, r, value,
-                                                             on, report, heap);
+    const I bad =
+        steps.lanes.update(group.belief + t.modes, t.n, m, t.modes, h, o, r, value, on, report, heap, write);
     if (any(bad)) note(fault, bad, report, t.modes, m, first, group.lanes);
     if (t.modes == 1) {  // one Gaussian has no law to reweigh, and is its own mixture
       V log_det{};

@@ -16,8 +16,8 @@ struct Model {
   const int* which = nullptr;
 };
 
-// kDoubtful: a model array given per track holds NaN, inf, or a covariance that is not exactly symmetric or has a
-// negative diagonal. Such arrays are too large to be read twice, so they are checked as they are loaded.
+// kDoubtful: a model array given per track holds NaN, inf, or a covariance that is not exactly symmetric or has
+// negative pivots. Such arrays are too large to be read twice, so they are checked as they are loaded.
 // kNotPositive, kTooFar, kNotFinite: a row that has no likelihood, as its Fault says.
 enum Status : int { kFine = 0, kNotPositive = 1, kInfinite = 2, kDoubtful = 4, kTooFar = 8, kNotFinite = 16 };
 
@@ -75,10 +75,11 @@ struct Kernel {
   int (*filter)(const Problem&, std::ptrdiff_t first_block, std::ptrdiff_t last_block, double* workspace);
   std::size_t (*bank_workspace)(const Tracks&, int m);
   std::size_t (*block_size)(const Tracks&);  // doubles
-  void (*bank_step)(const Tracks&, Rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
+  // Returns kDoubtful, and has done nothing, where the arrays are.
+  int (*bank_step)(const Tracks&, Rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
                     double* workspace);
   // Measures rows, and conditions them when `write`; z is (count, m), d2 and log_likelihood (count,). Returns the first
-  // fault; a row that is only measured may be too far away, with a log-likelihood of -inf.
+  // fault (kDoubtful: nothing was done); a row that is only measured may be too far away, with a log-likelihood of -inf.
   Fault (*bank_measure)(const Tracks&, Rows, bool write, int m, const double* z, const Model& H, const Model& d,
                       const Model& R, double* d2, double* log_likelihood, double* workspace);
   void (*bank_moments)(const Tracks&, Rows, double* mean, double* cov, double* probs, double* workspace);

@@ -48,9 +48,8 @@ SALTUS_INLINE I finite(V a) { return a - a == 0.0; }
 // digits, are several times cheaper than a division, and may overlap.
 SALTUS_INLINE V reciprocal(V a) {
 #if defined(__AVX512F__)
-  V y = __builtin_ia32_rcp14pd512_mask(a, V{}, -1);
-  y += y * (1.0 - a * y);
-  return y + y * (1.0 - a * y);
+  const V y = __builtin_ia32_rcp14pd512_mask(a, V{}, -1), e = 1.0 - a * y, once = y + y * e;
+  return once + once * (e * e);
 #else
   return 1.0 / a;
 #endif

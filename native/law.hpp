@@ -88,7 +88,7 @@ inline Fault fault_of(const V* report, int modes, int m, int l) {
     for (int a = 0; a < m; ++a) {
       const double nu = r[2 + m + a][l], S = r[2 + 2 * m + packed(a, a)][l], away = __builtin_fabs(nu) / __builtin_sqrt(S);
       if (!(nu - nu == 0.0) || !(S - S == 0.0)) return {kNotFinite, 0, a};
-      if (!(r[2 + a][l] > 0.0)) return {kNotPositive, 0, a};
+      if (!certain(r[2 + a][l], S)) return {kNotPositive, 0, a};
       if (away > worst) worst = away, at = a;
     }
     if (worst < least) least = worst, component = at;

@@ -6,132 +6,196 @@
 
 namespace saltus::SALTUS_NS {
 
+// Share of S_aa below which the innovation variance of component a, given those before it, is the square of rounding.
+inline constexpr double kEmpty = 0x1p-98;
+
+// Whether an innovation variance s, of `whole` before those before it, is more than rounding.
+SALTUS_INLINE I certain(V s, V whole) { return s > maximum(kEmpty * whole, splat(kNothing)); }
+SALTUS_INLINE bool certain(double s, double whole) { return s > kEmpty * whole && s > kNothing; }
+
 // Per mode in `report`: [d2 | 1 / det S | pivots (m) | nu (m) | S packed].
 SALTUS_INLINE constexpr int report_size(int m) { return 2 + 2 * m + triangle(m); }
 
-// S = L D L' in place of S: `inverse` becomes D^-1, 0 where not seen, and nu becomes L^-1 nu. Says d2, 1 / det S and
-// the pivots in `report`; returns the lanes in which S was not positive definite.
-template <int M>
-SALTUS_INLINE I factor(int m, Local<triangle(M)>& L, Local<M>& nu, Local<M>& inverse, const V* on, V* report) {
+// State x+ and measurement y of one mode, as rows over independent sources: those of the state before (n), of variance
+// D, and those of the noise (m). `Own`: source n + a is the noise of component a given those before it, with a one in
+// its row of y; the noise enters y alone.
+template <int N, int M>
+struct Deviations {
+  Local<N * (N + M)> x;
+  Local<M * (N + M)> y;
+  Local<N + M> weight, c;
+  Local<M> nu;
+  SALTUS_INLINE Deviations(V*& heap, int n, int m)
+      : x(heap, n * (n + m)), y(heap, m * (n + m)), weight(heap, n + m), c(heap, n + m), nu(heap, m) {}
+};
+
+// S = Y Y' into the report, with rows and columns of the unit matrix for what was not seen.
+template <int N, int M, int WIDE, bool Own>
+SALTUS_INLINE void innovation(int n, int m, int wide, Deviations<N, M>& by, const V* on, V* report) {
+  each<M>(m, [&](int back) SALTUS_LAMBDA {
+    const int a = m - 1 - back;  // the first last: its weighted row is the first that the sweep needs
+    const int last = Own && N > 0 ? n + a + 1 : wide;  // columns that may hold anything
+    report[2 + m + a] = by.nu[a];
+    from<WIDE>(0, wide, [&](int k) SALTUS_LAMBDA {
+      if (k < last) by.c[k] = by.y[a * wide + k] * by.weight[k];
+    });
+    upto<M>(a, [&](int b) SALTUS_LAMBDA {
+      const V sum = dot<WIDE>(
+          0, Own && N > 0 ? n + b + 1 : wide, [&](int k) SALTUS_LAMBDA { return by.c[k]; },
+          [&](int k) SALTUS_LAMBDA { return by.y[b * wide + k]; });
+      report[2 + 2 * m + packed(a, b)] = a == b ? select(on[a] != 0.0, sum, splat(1.0)) : sum * (on[a] * on[b]);
+    });
+  });
+}
+
+// r -= g c', g = r c W / s, and the same of what goes with the row; `filled` says how much of r is not zero.
+template <int WIDE>
+SALTUS_INLINE V swept(int filled, int last, V* r, const V* weighted, const V* c, V share_of) {
+  const V share = share_of * dot<WIDE>(
+                                 0, filled, [&](int k) SALTUS_LAMBDA { return r[k]; },
+                                 [&](int k) SALTUS_LAMBDA { return weighted[k]; });
+  from<WIDE>(0, last, [&](int k) SALTUS_LAMBDA {
+    if (k < last) r[k] = k < filled ? r[k] - share * c[k] : -share * c[k];
+  });
+  return share;
+}
+
+// Take what was measured, one component after the other, out of the components after it and, if `write`, of the state.
+// With c the row in hand, nu its innovation and s = c c':
+//
+//   K = X c' / s,   x += K nu,   X -= K c,   and so for the rows of y that are left.
+//
+// Gram-Schmidt on the rows of y, in which no S is inverted: X X' stays a sum of squares whatever was subtracted. Says
+// d2, 1 / det S and the pivots s in the report; returns the lanes in which nothing but rounding was left of a component
+// that was seen.
+template <int N, int M, int WIDE, bool Own>
+SALTUS_INLINE I sweep(int n, int m, int wide, Deviations<N, M>& by, const V* on, V* state, V* report, bool write) {
   V d2{}, inverse_det = splat(1.0);
   I bad{};
   each<M>(m, [&](int a) SALTUS_LAMBDA {
-    const V pivot = L[packed(a, a)];
-    bad |= ~(pivot > 0.0);
-    report[2 + a] = pivot;
-    const V one_over = reciprocal(pivot);
-    inverse_det *= one_over;
-    inverse[a] = one_over * on[a];
-    from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA {
-      const V factor = L[packed(b, a)] * one_over;
-      nu[b] -= factor * nu[a];
-      from<M>(a + 1, m, [&](int c) SALTUS_LAMBDA {
-        if (c <= b) L[packed(b, c)] -= factor * L[packed(c, a)];
+    V *row = &by.y[a * wide], *c = &by.c[0];
+    const V whole = report[2 + 2 * m + packed(a, a)];
+    const int last = Own && N > 0 ? n + a + 1 : wide;
+    V s = whole;
+    if (a > 0) {
+      from<WIDE>(0, wide, [&](int k) SALTUS_LAMBDA {
+        if (k < last) c[k] = row[k] * by.weight[k];
       });
-    });
-    from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA { L[packed(b, a)] *= one_over; });
-    d2 += nu[a] * nu[a] * inverse[a];
+      const V sum = dot<WIDE>(
+          0, last, [&](int k) SALTUS_LAMBDA { return c[k]; }, [&](int k) SALTUS_LAMBDA { return row[k]; });
+      s = select(on[a] != 0.0, sum, splat(1.0));
+    }
+    bad |= ~certain(s, whole);
+    const V one_over = reciprocal(s), share_of = one_over * on[a], nu = by.nu[a];
+    report[2 + a] = s;
+    inverse_det *= one_over;
+    d2 += nu * share_of * nu;
+    from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA { by.nu[b] -= nu * swept<WIDE>(last, last, &by.y[b * wide], c, row, share_of); });
+    if (!write) return;
+    if constexpr (N > 0)
+      each<N>(n, [&](int i) SALTUS_LAMBDA {
+        const int filled = !Own ? wide : a == 0 ? i + 1 : n + a;
+        state[i] += nu * swept<WIDE>(filled, last, &by.x[i * wide], c, row, share_of);
+      });
+    else
+#pragma GCC unroll 2
+      for (int i = 0; i < n; ++i) state[i] += nu * swept<WIDE>(wide, wide, &by.x[i * wide], c, row, share_of);
   });
   report[0] = d2;
   report[1] = inverse_det;
   return bad;
 }
 
-// K = U S^-1 and x += K nu, of what `factor` left. `w` is scratch.
-template <int N, int M>
-SALTUS_INLINE void gain(int n, int m, Local<N * M>& U, Local<triangle(M)>& L, Local<M>& inverse, Local<M>& nu,
-                        Local<M>& w, V* x, Local<N * M>& K) {
-  each<N>(n, [&](int i) SALTUS_LAMBDA {
-    each<M>(m, [&](int a) SALTUS_LAMBDA {
-      V g = U[i * m + a];
-      upto<M>(a - 1, [&](int b) SALTUS_LAMBDA { g -= L[packed(a, b)] * w[b]; });
-      w[a] = g;
+// Innovation and sweep and, if `write`, the squares of what is left.
+template <int N, int M, int WIDE, bool Own, class E>
+SALTUS_INLINE I conditioned_known(int n, int m, int wide, Deviations<N, M>& by, const V* on, V* state, V* report,
+                                  const E* Q, int stride, V* heap, bool write) {
+  innovation<N, M, WIDE, Own>(n, m, wide, by, on, report);
+  const I bad = sweep<N, M, WIDE, Own>(n, m, wide, by, on, state, report, write);
+  if (write) squares_known<N, WIDE>(n, wide, &by.x[0], &by.weight[0], Q, stride, state + n, heap);
+  return bad;
+}
+
+template <int WIDE, bool Own, class E>
+__attribute__((noinline)) I conditioned_apart(int n, int m, int wide, Deviations<0, 0>& by, const V* on, V* state,
+                                              V* report, const E* Q, int stride, V* heap, bool write) {
+  return conditioned_known<0, 0, WIDE, Own>(n, m, wide, by, on, state, report, Q, stride, heap, write);
+}
+
+template <int N, int M, bool Own, class E>
+SALTUS_INLINE I conditioned(int n, int m, Deviations<N, M>& by, const V* on, V* state, V* report, const E* Q, int stride,
+                            V* heap, bool write) {
+  const int wide = n + m;
+  if constexpr (N > 0) return conditioned_known<N, M, N + M, Own>(n, m, wide, by, on, state, report, Q, stride, heap, write);
+  I bad{};
+  if constexpr (N == 0)
+    by_size<7>(wide, [&]<int WIDE>() SALTUS_LAMBDA {
+      bad = conditioned_apart<WIDE, Own>(n, m, wide, by, on, state, report, Q, stride, heap, write);
     });
-    V moved = x[i];
-    each<M>(m, [&](int a) SALTUS_LAMBDA {
-      w[a] *= inverse[a];
-      moved += w[a] * nu[a];
+  return bad;
+}
+
+// B of R = B C B', with its C as weights; most noises are independent, and have none.
+template <int N, int M, class E>
+SALTUS_INLINE void noise_rows(int n, int m, const E* r, Deviations<N, M>& by, V* heap) {
+  const int wide = n + m;
+  I related{};
+  each<M>(m, [&](int a) SALTUS_LAMBDA {
+    by.weight[n + a] = splat(r[a * m + a]);
+    upto<M>(a - 1, [&](int b) SALTUS_LAMBDA {
+      by.y[a * wide + n + b] = splat(r[a * m + b]);
+      related |= by.y[a * wide + n + b] != 0.0;
     });
-    x[i] = moved;
-    each<M>(m, [&](int back) SALTUS_LAMBDA {
-      const int a = m - 1 - back;
-      V g = w[a];
-      from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA { g -= L[packed(b, a)] * K[i * m + b]; });
-      K[i * m + a] = g;
-    });
+    by.y[a * wide + n + a] = splat(1.0);
+    if constexpr (N == 0)
+      for (int b = a + 1; b < m; ++b) by.y[a * wide + n + b] = V{};
+  });
+  if (!any(related)) return;
+  Local<triangle(M)> B(heap, triangle(m));
+  each<M>(m, [&](int a) SALTUS_LAMBDA {
+    upto<M>(a, [&](int b) SALTUS_LAMBDA { B[packed(a, b)] = splat(r[a * m + b]); });
+  });
+  factor<M>(m, B, heap);
+  each<M>(m, [&](int a) SALTUS_LAMBDA {
+    by.weight[n + a] = B[packed(a, a)];
+    upto<M>(a - 1, [&](int b) SALTUS_LAMBDA { by.y[a * wide + n + b] = B[packed(a, b)]; });
   });
 }
 
-// Measure and condition every mode (`Gain`), or measure only, in Joseph form.
+// Measure every mode and, if `write`, condition it: z = H x + v, P = L D L', R = B C B'.
 //
-//   nu = z - H x - d,  U = P H',  S = H U + R = L D L',  K = U S^-1,  T = P - K U' = (I - K H) P,
-//   P+ = T (I - K H)' + K R K' = T - (T H' - K R) K'.
-//
-// The last form costs n^2 m where the product with I - K H costs n^3, and keeps what makes Joseph's form safe: an
-// error in T is multiplied by (I - K H)', which annihilates it in the measured directions. A component not seen
-// (on = 0) has its row of nu, of L and of D^-1 zero, hence its column of K: no branch. Returns the lanes in which an S
-// was not positive definite.
-template <int N, int M, class E, bool Gain>
+//   nu = z - H x - d,   Y = [H L  B],   X = [L  0],   W = (D, C);   P+ = X W X' after the sweep
+template <int N, int M, class E>
 I measure(V* state, int size_n, int size_m, int modes, ByMode<E> H, ByMode<E> d, ByMode<E> R, const V* z, const V* on,
-          V* report, V* heap) {
-  const int n = N > 0 ? N : size_n, m = M > 0 ? M : size_m;
+          V* report, V* heap, bool write) {
+  const int n = N > 0 ? N : size_n, m = M > 0 ? M : size_m, wide = n + m;
   const int record = n + triangle(n);
   I bad{};
   for (int mode = 0; mode < modes; ++mode, state += record, report += report_size(m)) {
-    V* free = heap;
-    const E *h = H[mode], *r = R[mode];
-    V *x = state, *P = state + n;
-    Local<N * M> U(free, n * m);
-    Local<triangle(M)> L(free, triangle(m));
-    Local<M> nu(free, m), inverse(free, m);
+    V *free = heap, *P = state + n;
+    const E* h = H[mode];
+    Local<triangle(N)> L(free, triangle(n));
+    Deviations<N, M> by(free, n, m);
     each<N>(n, [&](int i) SALTUS_LAMBDA {
-      each<M>(m, [&](int a) SALTUS_LAMBDA {
-        V sum = P[packed(i, 0)] * h[a * n];
-        from<N>(1, n, [&](int k) SALTUS_LAMBDA { sum += P[packed(i, k)] * h[a * n + k]; });
-        U[i * m + a] = sum;
-      });
+      upto<N>(i, [&](int j) SALTUS_LAMBDA { L[packed(i, j)] = P[packed(i, j)]; });
     });
-    V* S = report + 2 + 2 * m;
+    factor<N>(n, L, free);
+    each<N>(n, [&](int i) SALTUS_LAMBDA { by.weight[i] = L[packed(i, i)]; });
     each<M>(m, [&](int a) SALTUS_LAMBDA {
       V residual = z[a];
       if (d.present()) residual -= d[mode][a];
-      each<N>(n, [&](int k) SALTUS_LAMBDA { residual -= x[k] * h[a * n + k]; });
-      nu[a] = residual * on[a];
-      report[2 + m + a] = nu[a];
-      upto<M>(a, [&](int b) SALTUS_LAMBDA {
-        V sum = splat(r[a * m + b]);
-        each<N>(n, [&](int k) SALTUS_LAMBDA { sum += U[k * m + b] * h[a * n + k]; });
-        sum = a == b ? select(on[a] != 0.0, sum, splat(1.0)) : sum * (on[a] * on[b]);
-        L[packed(a, b)] = sum;
-        S[packed(a, b)] = sum;
-      });
+      each<N>(n, [&](int k) SALTUS_LAMBDA { residual -= state[k] * h[a * n + k]; });
+      by.nu[a] = residual * on[a];
     });
-    bad |= factor<M>(m, L, nu, inverse, on, report);
-    if constexpr (Gain) {
-      Local<N * M> K(free, n * m);
-      Local<N> T(free, n);
-      Local<M> w(free, m);
-      gain<N, M>(n, m, U, L, inverse, nu, w, x, K);
-      // In place: row i writes P[i][j <= i] only, which no later row reads.
+    times_root<N, M>(n, m, h, n, L, &by.y[0], wide);
+    noise_rows<N, M, E>(n, m, R[mode], by, free);
+    if (write)
       each<N>(n, [&](int i) SALTUS_LAMBDA {
-        each<N>(n, [&](int j) SALTUS_LAMBDA {
-          V t = P[packed(i, j)];
-          each<M>(m, [&](int a) SALTUS_LAMBDA { t -= K[i * m + a] * U[j * m + a]; });
-          T[j] = t;
-        });
-        each<M>(m, [&](int a) SALTUS_LAMBDA {
-          V g = T[0] * h[a * n];
-          from<N>(1, n, [&](int k) SALTUS_LAMBDA { g += T[k] * h[a * n + k]; });
-          each<M>(m, [&](int b) SALTUS_LAMBDA { g -= K[i * m + b] * r[a * m + b]; });
-          w[a] = g;
-        });
-        upto<N>(i, [&](int j) SALTUS_LAMBDA {
-          V t = T[j];
-          each<M>(m, [&](int a) SALTUS_LAMBDA { t -= w[a] * K[j * m + a]; });
-          P[packed(i, j)] = t;
-        });
+        upto<N>(i, [&](int k) SALTUS_LAMBDA { by.x[i * wide + k] = k == i ? splat(1.0) : L[packed(i, k)]; });
+        if (N == 0)
+          for (int k = i + 1; k < wide; ++k) by.x[i * wide + k] = V{};
       });
-    }
+    bad |= conditioned<N, M, true, double>(n, m, by, on, state, report, nullptr, 0, free, write);
   }
   return bad;
 }
@@ -141,99 +205,48 @@ I measure(V* state, int size_n, int size_m, int modes, ByMode<E> H, ByMode<E> d,
 // `known` before the interval and only x is in the state: Phi = [A D; C E], with known inputs D y and E y. The noises
 // e of s and f of y are e = M u + v, f = M_f u, cov u = I, cov v = Q: `noise` is [Q | cov(e, f) | M] by rows of s.
 //
-//   x~ = A x + b,  nu = z - C x - d,  V = P C',  U = A V + N_ef,  S = C V + N_ff = L D L',  K = U S^-1,  G = A - K C,
-//   P+ = G P G' + [I -K] N [I -K]' = G P G' + (M - K M_f) (M - K M_f)' + Q.
+//   x~ = A x + b,  nu = z - C x - d,  X = [A L  M],  Y = [C L  M_f],  W = (D, 1),  P = L D L';  P+ = X W X' + Q
 //
-// The last form is a sum of squares: what the measurement tells exactly is left with a variance of 0, not of rounding.
+// What the measurement tells exactly is left with a variance of rounding's square.
 template <int N, int M, class E, bool Inside>
-I advance(V* state, int size_n, int size_m, int modes, ByMode<E> Phi, ByMode<E> b, ByMode<E> noise, const V* known, const V* z, const V* on, V* report, V* heap) {
+I advance(V* state, int size_n, int size_m, int modes, ByMode<E> Phi, ByMode<E> b, ByMode<E> noise, const V* known,
+          const V* z, const V* on, V* report, V* heap) {
   if constexpr (Inside && N > 0 && N <= M) return I{};  // there is no such state
-  const int n = N > 0 ? N : size_n, m = M > 0 ? M : size_m;
+  const int n = N > 0 ? N : size_n, m = M > 0 ? M : size_m, wide = n + m;
   const int all = Inside ? n : n + m, y = all - m;  // the size of s, and where y begins in it
-  const int wide = all + 2 * m;
-  const int record = n + triangle(n);
+  const int stride = all + 2 * m, record = n + triangle(n);
   I bad{};
   for (int mode = 0; mode < modes; ++mode, state += record, report += report_size(m)) {
-    V* free = heap;
-    const E *A = Phi[mode], *C = A + y * all;
-    const E *Q = noise[mode], *N_e = Q + all, *M_e = N_e + m, *N_f = N_e + y * wide, *M_f = M_e + y * wide;
+    V *free = heap, *P = state + n;
+    const E *A = Phi[mode], *C = A + y * all, *Q = noise[mode], *M_e = Q + all + m, *M_f = M_e + y * stride;
     const E* input = b.present() ? b[mode] : nullptr;
     Local<N> x(free, n);
-    Local<triangle(N)> P(free, triangle(n));
-    Local<N * M> W(free, n * m), U(free, n * m);
-    Local<triangle(M)> L(free, triangle(m));
-    Local<M> nu(free, m), inverse(free, m), w(free, m);
+    Local<triangle(N)> L(free, triangle(n));
+    Deviations<N, M> by(free, n, m);
     each<N>(n, [&](int i) SALTUS_LAMBDA {
       x[i] = state[i];
-      upto<N>(i, [&](int j) SALTUS_LAMBDA { P[packed(i, j)] = state[n + packed(i, j)]; });
+      upto<N>(i, [&](int j) SALTUS_LAMBDA { L[packed(i, j)] = P[packed(i, j)]; });
     });
-    each<N>(n, [&](int i) SALTUS_LAMBDA {
-      each<M>(m, [&](int a) SALTUS_LAMBDA {
-        V sum = P[packed(i, 0)] * C[a * all];
-        from<N>(1, n, [&](int k) SALTUS_LAMBDA { sum += P[packed(i, k)] * C[a * all + k]; });
-        W[i * m + a] = sum;
-      });
-    });
-    V* S = report + 2 + 2 * m;
+    factor<N>(n, L, free);
+    each<N>(n, [&](int i) SALTUS_LAMBDA { by.weight[i] = L[packed(i, i)]; });
     each<M>(m, [&](int a) SALTUS_LAMBDA {
       V residual = input ? z[a] - input[y + a] : z[a];
       each<N>(n, [&](int k) SALTUS_LAMBDA { residual -= x[k] * C[a * all + k]; });
-      if constexpr (Inside)
-        residual *= on[a];
-      else
-        each<M>(m, [&](int c) SALTUS_LAMBDA { residual -= known[c] * C[a * all + y + c]; });
-      nu[a] = residual;
-      report[2 + m + a] = residual;
-      upto<M>(a, [&](int c) SALTUS_LAMBDA {
-        V sum = splat(N_f[a * wide + c]);
-        each<N>(n, [&](int k) SALTUS_LAMBDA { sum += W[k * m + c] * C[a * all + k]; });
-        if constexpr (Inside) sum = a == c ? select(on[a] != 0.0, sum, splat(1.0)) : sum * (on[a] * on[c]);
-        L[packed(a, c)] = sum;
-        S[packed(a, c)] = sum;
-      });
+      if constexpr (!Inside) each<M>(m, [&](int c) SALTUS_LAMBDA { residual -= known[c] * C[a * all + y + c]; });
+      by.nu[a] = residual * on[a];
+      by.weight[n + a] = splat(1.0);
+      each<M>(m, [&](int c) SALTUS_LAMBDA { by.y[a * wide + n + c] = splat(M_f[a * stride + c]); });
     });
-    bad |= factor<M>(m, L, nu, inverse, on, report);
+    times_root<N, M>(n, m, C, all, L, &by.y[0], wide);
+    times_root<N, N>(n, n, A, all, L, &by.x[0], wide);
     each<N>(n, [&](int i) SALTUS_LAMBDA {
       V moved = input ? splat(input[i]) : V{};
       each<N>(n, [&](int k) SALTUS_LAMBDA { moved += x[k] * A[i * all + k]; });
       if constexpr (!Inside) each<M>(m, [&](int c) SALTUS_LAMBDA { moved += known[c] * A[i * all + y + c]; });
       state[i] = moved;
-      each<M>(m, [&](int a) SALTUS_LAMBDA {
-        V sum = splat(N_e[i * wide + a]);
-        each<N>(n, [&](int k) SALTUS_LAMBDA { sum += W[k * m + a] * A[i * all + k]; });
-        U[i * m + a] = sum;
-      });
+      each<M>(m, [&](int a) SALTUS_LAMBDA { by.x[i * wide + n + a] = splat(M_e[i * stride + a]); });
     });
-    Local<N * M>& K = W;
-    gain<N, M>(n, m, U, L, inverse, nu, w, state, K);
-    Local<N * N> G(free, n * n);
-    Local<N> T(free, n);
-    Local<N * M>& D = U;
-    each<N>(n, [&](int i) SALTUS_LAMBDA {
-      each<N>(n, [&](int k) SALTUS_LAMBDA {
-        V g = splat(A[i * all + k]);
-        each<M>(m, [&](int a) SALTUS_LAMBDA { g -= K[i * m + a] * C[a * all + k]; });
-        G[i * n + k] = g;
-      });
-      each<M>(m, [&](int a) SALTUS_LAMBDA {
-        V g = splat(M_e[i * wide + a]);
-        each<M>(m, [&](int c) SALTUS_LAMBDA { g -= K[i * m + c] * M_f[c * wide + a]; });
-        D[i * m + a] = g;
-      });
-    });
-    each<N>(n, [&](int i) SALTUS_LAMBDA {
-      each<N>(n, [&](int c) SALTUS_LAMBDA {
-        V t = G[i * n] * P[packed(0, c)];
-        from<N>(1, n, [&](int k) SALTUS_LAMBDA { t += G[i * n + k] * P[packed(k, c)]; });
-        T[c] = t;
-      });
-      upto<N>(i, [&](int j) SALTUS_LAMBDA {
-        V sum = splat(Q[i * wide + j]);
-        each<M>(m, [&](int a) SALTUS_LAMBDA { sum += D[i * m + a] * D[j * m + a]; });
-        each<N>(n, [&](int c) SALTUS_LAMBDA { sum += T[c] * G[j * n + c]; });
-        state[n + packed(i, j)] = sum;
-      });
-    });
+    bad |= conditioned<N, M, false>(n, m, by, on, state, report, Q, stride, free, true);
   }
   return bad;
 }
@@ -242,6 +255,7 @@ I advance(V* state, int size_n, int size_m, int modes, ByMode<E> Phi, ByMode<E> 
 template <int M>
 V mixture_nis(const V* report, const V* probs, int size_m, int modes, V* heap) {
   const int m = M > 0 ? M : size_m;
+  if (modes == 1) return report[0];  // one Gaussian is its own mixture
   const V* first = report + 2 + m;
   const int size = report_size(m);
   Local<M> mean(heap, m), gap(heap, m);
@@ -262,9 +276,10 @@ V mixture_nis(const V* report, const V* probs, int size_m, int modes, V* heap) {
     });
   }
   V d2{};
+  each<M>(m, [&](int a) SALTUS_LAMBDA { gap[a] = S[packed(a, a)] * (kRounding * m); });
   each<M>(m, [&](int a) SALTUS_LAMBDA {
-    const V one_over = reciprocal(S[packed(a, a)]);
-    d2 += mean[a] * mean[a] * one_over;
+    const V one_over = reciprocal(maximum(S[packed(a, a)], gap[a]));
+    d2 += mean[a] * one_over * mean[a];
     from<M>(a + 1, m, [&](int b) SALTUS_LAMBDA {
       const V factor = S[packed(b, a)] * one_over;
       mean[b] -= factor * mean[a];

@@ -160,7 +160,7 @@ class Bank {
     tracks_.data = data_.get();
   }
 
-  void step(const Index& index, const nb::sequence& trans, nb::handle F, nb::handle b, nb::handle Q) {
+  int step(const Index& index, const nb::sequence& trans, nb::handle F, nb::handle b, nb::handle Q) {
     const std::vector<std::int64_t> held_rows = checked(index);
     const saltus::Rows rows{held_rows.data(), Size(held_rows.size())};
     const Reading as{modes_, rows.count, 1, false};
@@ -172,7 +172,7 @@ class Bank {
     std::vector<Held> held;
     std::vector<Model> chains;
     read_transitions(held, chains, trans, modes_, rows.count, 1, false);
-    kernel_.bank_step(tracks_, rows, chains.data(), f.model, u.model, q.model, space(1));
+    return kernel_.bank_step(tracks_, rows, chains.data(), f.model, u.model, q.model, space(1));
   }
 
   nb::tuple measure(const Index& index, bool write, const Array& z, nb::handle H, nb::handle d, nb::handle R, const Out& d2,

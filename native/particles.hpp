@@ -49,8 +49,8 @@ inline Fault expand_rows(const Tracks& t, Rows rows, const Branches& to, int m, 
       value[a] = select(value[a] == value[a], value[a], V{});
       seen += on[a];
     }
-    const I bad = steps.shared.score(states, t.n, m, M, {H.data, H.which, H.core}, {d.data, d.which, d.core},
-                                     {R.data, R.which, R.core}, value, on, report, heap);
+    const I bad = steps.shared.update(states, t.n, m, M, {H.data, H.which, H.core}, {d.data, d.which, d.core},
+                                     {R.data, R.which, R.core}, value, on, report, heap, false);
     if (any(bad)) note(fault, bad, report, M, m, first, group.lanes);
     bool logs = false;
     const V likelihood = reweigh(law, logs, M, m, report, seen, heap);

@@ -120,7 +120,7 @@ class Recursion {
   ByMode<V> by_lane(const Model& model, Size k, V* staged, int order) {
     if (k == 0 || model.time) {
       load_model(model, first, p.n_tracks, k, staged);
-      if (model.row && any(doubtful(model, staged, order))) status |= kDoubtful;
+      if (model.row && any(doubtful(model, staged, order, heap))) status |= kDoubtful;
     }
     return by_mode<V>(model, staged);
   }
@@ -164,8 +164,9 @@ class Recursion {
   I measure(Size k) {
     if (sensor_by_lane)
       return full.lanes.update(state, n, m, p.modes, by_lane(p.H, k, H, 0), by_lane(p.d, k, d, 0),
-                               by_lane(p.R, k, R, m), z, on, report, heap);
-    return full.shared.update(state, n, m, p.modes, shared(p.H, k), shared(p.d, k), shared(p.R, k), z, on, report, heap);
+                               by_lane(p.R, k, R, m), z, on, report, heap, true);
+    return full.shared.update(state, n, m, p.modes, shared(p.H, k), shared(p.d, k), shared(p.R, k), z, on, report, heap,
+                              true);
   }
 
   void update(Size k) {

@@ -80,17 +80,44 @@ inline void load_model(const Model& model, Size first, Size n_tracks, Size step,
   load_lanes(rows, count, out);
 }
 
-// Lanes in which a loaded array holds NaN or inf or, for matrices of order n > 0, is no covariance on the face of it.
-inline I doubtful(const Model& model, const V* loaded, int n) {
+// Part of a variance by which a pivot may be negative before the matrix is no covariance.
+inline constexpr double kIndefinite = 1e-8;
+
+// Lanes in which a full matrix of order n is no covariance, by its pivots; `rest` holds n^2 numbers.
+inline I indefinite(const V* a, int n, V* rest) {
   I bad{};
-  const int count = model.distinct * model.core;
-  for (int i = 0; i < count; ++i) bad |= ~finite(loaded[i]);
-  if (n == 0) return bad;
-  for (const V* a = loaded; a < loaded + count; a += n * n)
-    for (int i = 0; i < n; ++i) {
-      bad |= a[i * n + i] < 0.0;
-      for (int j = 0; j < i; ++j) bad |= a[i * n + j] != a[j * n + i];
+  for (int i = 0; i < n * n; ++i) rest[i] = a[i];
+  for (int j = 0; j < n; ++j) {
+    const V pivot = rest[j * n + j], least = kIndefinite * a[j * n + j];
+    const I dead = pivot <= least;
+    bad |= (pivot < -least) | (a[j * n + j] < 0.0);
+    const V one_over = select(dead, V{}, reciprocal(pivot));
+    for (int i = j + 1; i < n; ++i) {
+      bad |= a[i * n + j] != a[j * n + i];
+      const V column = rest[i * n + j], share = column * one_over;
+      bad |= dead & (column * column > kIndefinite * (a[j * n + j] * a[i * n + i]));
+      for (int k = j + 1; k <= i; ++k) rest[i * n + k] -= share * rest[k * n + j];
     }
+  }
+  return bad;
+}
+
+// Lanes in which a loaded array holds NaN or inf or, for matrices of order n > 0, is no covariance.
+inline I doubtful(const Model& model, const V* loaded, int n, V* heap) {
+  I bad{};
+  const int count = model.data ? model.distinct * model.core : 0;
+  for (int i = 0; i < count; ++i) bad |= ~finite(loaded[i]);
+  for (const V* a = loaded; n > 0 && a < loaded + count; a += n * n) bad |= indefinite(a, n, heap);
+  return bad;
+}
+
+// The same of all rows of a model, before anything is done with it.
+inline bool doubtful_rows(const Model& model, Size rows, int n, V* loaded, V* heap) {
+  bool bad = false;
+  for (Size first = 0; first < (model.row ? rows : rows > 0); first += W) {
+    load_model(model, first, rows, 0, loaded);
+    bad = bad || any(doubtful(model, loaded, n, heap));
+  }
   return bad;
 }
 

@@ -5,15 +5,13 @@ namespace saltus::SALTUS_NS {
 
 template <int N, int M, class E>
 constexpr StagesOf<E> of() {
-  // Runs that move each in its own way are rare where noise is coloured: sizes known at run time will do.
-  constexpr bool common = sizeof(E) == sizeof(double);
-  constexpr int n = common ? N : 0, m = common ? M : 0;
-  return {mix<N, E>,
-          propagate<N, E>,
-          measure<N, M, E, true>,
-          measure<N, M, E, false>,
-          advance<n, m, E, false>,
-          advance<n, m, E, true>};
+  // Where noise is coloured, runs that move each in its own way are rare, and so are gaps: sizes known at run time,
+  // compiled once, will do (`stages`).
+  constexpr bool any = N == 0, common = any || sizeof(E) == sizeof(double);
+  StagesOf<E> found{mix<N, E>, propagate<N, E>, measure<N, M, E>, nullptr, nullptr};
+  if constexpr (common) found.advance = advance<N, M, E, false>;
+  if constexpr (any) found.advance_inside = advance<N, M, E, true>;
+  return found;
 }
 
 template <int N, int M>
@@ -39,11 +37,11 @@ Stages by_n(int n, int m) {
   return by_m<N>(m);
 }
 
-Stages SALTUS_LOOKUP(int n, int m) {
-#ifdef SALTUS_ANY_N
-  if (n == 0) return make<0, 0>();
-#endif
-  return by_n<SALTUS_FIRST_N>(n, m);
+Stages SALTUS_LOOKUP([[maybe_unused]] int n, [[maybe_unused]] int m) {
+  if constexpr (SALTUS_FIRST_N == 0)
+    return make<0, 0>();
+  else
+    return by_n<SALTUS_FIRST_N>(n, m);
 }
 
 }  // namespace saltus::SALTUS_NS

@@ -10,8 +10,14 @@
 namespace saltus::SALTUS_NS {
 
 #ifndef SALTUS_UNROLL
-#define SALTUS_UNROLL 9
+#define SALTUS_UNROLL 13
 #endif
+
+// Share of a variance that is rounding, for each of the subtractions it went through.
+inline constexpr double kRounding = 0x1p-51;
+
+// A variance below it is none: its reciprocal would overflow. Twin of linalg.NOTHING.
+inline constexpr double kNothing = 0x1p-1000;
 
 // Keeps the moments of a mode of probability zero defined, and touches nothing else.
 inline constexpr double kFloor = 1e-290;
@@ -20,7 +26,7 @@ inline constexpr double kFloor = 1e-290;
 template <int N, class F>
 SALTUS_INLINE void each(int n, F f) {
   if constexpr (N > 0 && N <= SALTUS_UNROLL) {
-#pragma GCC unroll 9
+#pragma GCC unroll 13
     for (int i = 0; i < N; ++i) f(i);
   } else {
     const int end = N > 0 ? N : n;
@@ -33,7 +39,7 @@ SALTUS_INLINE void each(int n, F f) {
 template <int N, class F>
 SALTUS_INLINE void upto(int i, F f) {
   if constexpr (N > 0 && N <= SALTUS_UNROLL) {
-#pragma GCC unroll 9
+#pragma GCC unroll 13
     for (int j = 0; j < N; ++j)
       if (j <= i) f(j);
   } else {
@@ -46,7 +52,7 @@ SALTUS_INLINE void upto(int i, F f) {
 template <int N, class F>
 SALTUS_INLINE void from(int i, int n, F f) {
   if constexpr (N > 0 && N <= SALTUS_UNROLL) {
-#pragma GCC unroll 9
+#pragma GCC unroll 13
     for (int j = 0; j < N; ++j)
       if (j >= i) f(j);
   } else {
@@ -54,6 +60,30 @@ SALTUS_INLINE void from(int i, int n, F f) {
 #pragma GCC unroll 1
     for (int j = i; j < end; ++j) f(j);
   }
+}
+
+// The sum of a(k) b(k) over first <= k < last <= N, in four sums that do not wait for
+// each other.
+template <int N, class A, class B>
+SALTUS_INLINE V dot(int first, int last, A a, B b) {
+  V sum[4] = {};
+  if constexpr (N > 0 && N <= SALTUS_UNROLL) {
+#pragma GCC unroll 13
+    for (int k = 0; k < N; ++k)
+      if (k >= first && k < last) sum[k & 3] += a(k) * b(k);
+  } else {
+    int k = first;
+#pragma GCC unroll 1
+    for (; k + 4 <= last; k += 4) {
+      sum[0] += a(k) * b(k);
+      sum[1] += a(k + 1) * b(k + 1);
+      sum[2] += a(k + 2) * b(k + 2);
+      sum[3] += a(k + 3) * b(k + 3);
+    }
+#pragma GCC unroll 1
+    for (; k < last; ++k) sum[0] += a(k) * b(k);
+  }
+  return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
 // Registers when the size is known (L > 0), a piece of `heap` otherwise.
@@ -210,7 +240,142 @@ void mix(V* state, V* law, int size_n, int outer, int size, int inner, const E* 
     }
 }
 
-// x <- F x + b, P <- F P F' + Q for every mode.
+// P = L D L' in place of the lower triangle of P, packed by rows: L, whose diagonal is of ones, below it, D on it. Where
+// rounding has left nothing of a variance its column is zero: L D L' is positive semidefinite whatever P is.
+template <int N, class P>
+SALTUS_INLINE void factor_known(int size_n, P& a, V* heap) {
+  const int n = N > 0 ? N : size_n;
+  Local<N> least(heap, n), column(heap, n);
+  each<N>(n, [&](int j) SALTUS_LAMBDA { least[j] = maximum(a[packed(j, j)] * (kRounding * n), splat(kNothing)); });
+  each<N>(n, [&](int j) SALTUS_LAMBDA {
+    const V pivot = a[packed(j, j)];
+    const I dead = pivot <= least[j];
+    const V one_over = select(dead, V{}, reciprocal(pivot));
+    a[packed(j, j)] = select(dead, 0.0 * pivot, pivot);  // what has overflowed is not nothing: it stays none
+    from<N>(j + 1, n, [&](int i) SALTUS_LAMBDA {
+      column[i] = a[packed(i, j)];
+      a[packed(i, j)] = column[i] * one_over;
+      // Its square first: the next pivot waits for the reciprocal alone.
+      if (i == j + 1) a[packed(i, i)] -= column[i] * column[i] * one_over;
+    });
+    from<N>(j + 2, n, [&](int i) SALTUS_LAMBDA {
+      from<N>(j + 1, n, [&](int k) SALTUS_LAMBDA {
+        if (k <= i) a[packed(i, k)] -= a[packed(i, j)] * column[k];
+      });
+    });
+  });
+}
+
+// row_c = sum_k f_k L_kc of what `factor` left, L with ones on its diagonal.
+template <int N, class E, class P>
+SALTUS_INLINE void times_root_known(int size_n, const E* f, P& L, V* row) {
+  const int n = N > 0 ? N : size_n;
+  each<N>(n, [&](int c) SALTUS_LAMBDA {
+    V sum = splat(f[c]);
+    from<N>(c + 1, n, [&](int k) SALTUS_LAMBDA { sum += L[packed(k, c)] * f[k]; });
+    row[c] = sum;
+  });
+}
+
+// P = X W X' + Q, of n rows of X over `wide` sources of variance W; Q, with rows of `stride`, is absent where null.
+template <int N, int WIDE, class E>
+SALTUS_INLINE void squares_known(int n, int size_wide, const V* x, const V* weight, const E* Q, int stride, V* P,
+                                 V* heap) {
+  const int wide = WIDE > 0 ? WIDE : size_wide;
+  const auto with = [&](int i, int j, V sum) SALTUS_LAMBDA { P[packed(i, j)] = Q ? Q[i * stride + j] + sum : sum; };
+  if constexpr (N > 0) {
+    Local<WIDE> row(heap, wide);
+    each<N>(n, [&](int i) SALTUS_LAMBDA {
+      each<WIDE>(wide, [&](int k) SALTUS_LAMBDA { row[k] = x[i * wide + k] * weight[k]; });
+      upto<N>(i, [&](int j) SALTUS_LAMBDA {
+        V sum{};
+        each<WIDE>(wide, [&](int k) SALTUS_LAMBDA { sum += row[k] * x[j * wide + k]; });
+        with(i, j, sum);
+      });
+    });
+  } else {
+    // Two rows by two: four sums that do not wait for each other, and two products for every load.
+    Local<WIDE> a(heap, wide), b(heap, wide);
+#pragma GCC unroll 1
+    for (int i = 0; i < n; i += 2) {
+      const V *x0 = x + i * wide, *x1 = i + 1 < n ? x0 + wide : x0;
+      each<WIDE>(wide, [&](int k) SALTUS_LAMBDA { a[k] = x0[k] * weight[k], b[k] = x1[k] * weight[k]; });
+#pragma GCC unroll 1
+      for (int j = 0; j <= i; j += 2) {
+        const V *y0 = x + j * wide, *y1 = j + 1 < n ? y0 + wide : y0;
+        V s00{}, s01{}, s10{}, s11{};
+        each<WIDE>(wide, [&](int k) SALTUS_LAMBDA {
+          s00 += a[k] * y0[k], s01 += a[k] * y1[k];
+          s10 += b[k] * y0[k], s11 += b[k] * y1[k];
+        });
+        with(i, j, s00);
+        if (j < i) with(i, j + 1, s01);
+        if (i + 1 == n) continue;
+        with(i + 1, j, s10);
+        with(i + 1, j + 1, s11);
+      }
+    }
+  }
+}
+
+// A size that the steps do not know is still known to the loops that do most of their work, up to kWidest.
+inline constexpr int kWidest = 13;
+
+template <int FROM, class F>
+SALTUS_INLINE void by_size(int size, F f) {
+  if constexpr (FROM > kWidest)
+    f.template operator()<0>();
+  else if (size == FROM)
+    f.template operator()<FROM>();
+  else
+    by_size<FROM + 1>(size, f);
+}
+
+template <int N>
+__attribute__((noinline)) void factor_apart(int n, V* a, V* heap) {
+  factor_known<N>(n, a, heap);
+}
+
+template <int N, class E>
+__attribute__((noinline)) void times_root_apart(int n, int rows, const E* f, int stride, const V* L, V* out, int wide) {
+#pragma GCC unroll 1
+  for (int i = 0; i < rows; ++i) times_root_known<N>(n, f + i * stride, L, out + i * wide);
+}
+
+template <int WIDE, class E>
+__attribute__((noinline)) void squares_apart(int n, int wide, const V* x, const V* weight, const E* Q, int stride, V* P,
+                                             V* heap) {
+  squares_known<0, WIDE>(n, wide, x, weight, Q, stride, P, heap);
+}
+
+template <int N, class P>
+SALTUS_INLINE void factor(int n, P& a, V* heap) {
+  if constexpr (N > 0)
+    factor_known<N>(n, a, heap);
+  else
+    by_size<7>(n, [&]<int SIZE>() SALTUS_LAMBDA { factor_apart<(SIZE < 10 ? SIZE : 0)>(n, &a[0], heap); });
+}
+
+// The same for `rows` rows of f, `stride` apart, into rows of `out`, `wide` apart.
+template <int N, int ROWS, class E, class P>
+SALTUS_INLINE void times_root(int n, int rows, const E* f, int stride, P& L, V* out, int wide) {
+  if constexpr (N > 0)
+    each<ROWS>(rows, [&](int i) SALTUS_LAMBDA { times_root_known<N>(n, f + i * stride, L, out + i * wide); });
+  else
+    by_size<7>(n, [&]<int SIZE>() SALTUS_LAMBDA {
+      times_root_apart<(SIZE < 10 ? SIZE : 0)>(n, rows, f, stride, &L[0], out, wide);
+    });
+}
+
+template <int N, int WIDE, class E>
+SALTUS_INLINE void squares(int n, int wide, const V* x, const V* weight, const E* Q, int stride, V* P, V* heap) {
+  if constexpr (N > 0)
+    squares_known<N, WIDE>(n, wide, x, weight, Q, stride, P, heap);
+  else
+    by_size<7>(wide, [&]<int SIZE>() SALTUS_LAMBDA { squares_apart<SIZE>(n, wide, x, weight, Q, stride, P, heap); });
+}
+
+// x <- F x + b, P <- (F L) D (F L)' + Q for every mode, P = L D L'.
 template <int N, class E>
 void propagate(V* state, int size_n, int modes, ByMode<E> F, ByMode<E> b, ByMode<E> Q, V* heap) {
   const int n = N > 0 ? N : size_n;
@@ -219,25 +384,21 @@ void propagate(V* state, int size_n, int modes, ByMode<E> F, ByMode<E> b, ByMode
     V* free = heap;
     const E *f = F[mode], *q = Q[mode];
     Local<triangle(N)> P(free, triangle(n));
-    Local<N> x(free, n), row(free, n);
+    Local<N * N> root(free, n * n);
+    Local<N> x(free, n), D(free, n);
     each<N>(n, [&](int i) SALTUS_LAMBDA {
       x[i] = state[i];
       upto<N>(i, [&](int j) SALTUS_LAMBDA { P[packed(i, j)] = state[n + packed(i, j)]; });
     });
+    factor<N>(n, P, free);
     each<N>(n, [&](int i) SALTUS_LAMBDA {
       V moved = b.present() ? splat(b[mode][i]) : V{};
       each<N>(n, [&](int k) SALTUS_LAMBDA { moved += x[k] * f[i * n + k]; });
       state[i] = moved;
-      each<N>(n, [&](int c) SALTUS_LAMBDA { row[c] = P[packed(0, c)] * f[i * n]; });
-      from<N>(1, n, [&](int k) SALTUS_LAMBDA {
-        each<N>(n, [&](int c) SALTUS_LAMBDA { row[c] += P[packed(k, c)] * f[i * n + k]; });
-      });
-      upto<N>(i, [&](int j) SALTUS_LAMBDA {
-        V sum = splat(q[i * n + j]);
-        each<N>(n, [&](int c) SALTUS_LAMBDA { sum += row[c] * f[j * n + c]; });
-        state[n + packed(i, j)] = sum;
-      });
+      D[i] = P[packed(i, i)];
     });
+    times_root<N, N>(n, n, f, n, P, &root[0], n);
+    squares<N, N>(n, n, &root[0], &D[0], q, n, state + n, free);
   }
 }
 

@@ -28,9 +28,9 @@ std::size_t bank_workspace(const Tracks& t, int m) {
 
 std::size_t block_size(const Tracks& t) { return block_of(t) * W; }
 
-void bank_step(const Tracks& t, Rows rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
-               double* workspace) {
-  step_rows(t, rows, trans, F, b, Q, arena(workspace));
+int bank_step(const Tracks& t, Rows rows, const Model* trans, const Model& F, const Model& b, const Model& Q,
+              double* workspace) {
+  return step_rows(t, rows, trans, F, b, Q, arena(workspace));
 }
 
 Fault bank_measure(const Tracks& t, Rows rows, bool write, int m, const double* z, const Model& H, const Model& d,

@@ -66,3 +66,10 @@ def test_a_root_of_what_rounding_has_made_indefinite(rng):
         np.abs((L @ L.swapaxes(-1, -2) - P) / (sigma[:, :, None] * sigma[:, None])).max() < 1e-11
     )  # rounding over the second pivot
     assert np.isnan(linalg.cholesky(np.array([[1.0, 2.0], [2.0, np.nan]]))).any()  # and no number out of none
+
+
+def test_a_root_at_the_ends_of_double_precision():
+    assert not linalg.cholesky(np.array([[1e-310]])).any()  # no variance, but rounding of a mode of probability zero
+    assert np.isnan(linalg.cholesky(np.array([[np.inf, 0.0], [0.0, 0.0]]))[0, 0])  # overflow is not nothing
+    barely = np.array([[1.0, 1.0], [1.0, 1.0 + 2e-16]])  # NumPy's own would take rounding for a variance
+    np.testing.assert_array_equal(linalg.cholesky(barely), [[1.0, 0.0], [1.0, 0.0]])

@@ -4,8 +4,18 @@ import numpy as np
 
 from saltus.shapes import Float
 
-__all__ = ["block_diagonal", "cholesky", "gaussian_terms", "logsumexp", "normalised", "quadratic_form", "symmetric"]
+__all__ = [
+    "NOTHING",
+    "block_diagonal",
+    "cholesky",
+    "gaussian_terms",
+    "logsumexp",
+    "normalised",
+    "quadratic_form",
+    "symmetric",
+]
 
+NOTHING = 2.0**-1000  # a variance below it is none: its reciprocal would overflow
 _ROUNDING = 2.0 * float(np.finfo(np.float64).eps)  # share of a variance below which what is left of it is rounding
 
 
@@ -55,21 +65,26 @@ def cholesky(P: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"
     whatever P is.
     """
     try:
-        return np.linalg.cholesky(P)
+        L = np.linalg.cholesky(P)
     except np.linalg.LinAlgError:
         return _semidefinite(np.asarray(P))
+    pivots, variances = (np.diagonal(a, axis1=-2, axis2=-1) for a in (L, P))
+    rounding = np.square(pivots) <= np.maximum(P.shape[-1] * _ROUNDING * variances, NOTHING)
+    return _semidefinite(np.asarray(P)) if rounding.any() else L
 
 
 def _semidefinite(P: Float[np.ndarray, "*lead n n"]) -> Float[np.ndarray, "*lead n n"]:
-    """Cholesky's columns one by one; a pivot at rounding ends its column. NaN stays NaN."""
+    """Cholesky's columns one by one; a pivot at rounding ends its column. NaN stays NaN, and what overflowed is NaN."""
     n = P.shape[-1]
     L = np.zeros_like(P)
     for j in range(n):
         rest = P[..., :, j] - (L[..., :, :j] @ L[..., j, :j, None])[..., 0]
         pivot = rest[..., j]
-        nothing = pivot <= n * _ROUNDING * P[..., j, j]
+        nothing = pivot <= np.maximum(n * _ROUNDING * P[..., j, j], NOTHING)
         column = rest / np.sqrt(np.where(nothing, 1.0, pivot))[..., None]
         L[..., j:, j] = np.where(nothing[..., None], 0.0, column[..., j:])
+        with np.errstate(invalid="ignore"):
+            L[..., j, j] += 0.0 * pivot
     return L
 
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from saltus.errors import ModelError, NumericalError
+from saltus.errors import ModelError
 from saltus.filters import Bank, Belief
 from strategies import law, random_cov, random_trans, rngs
 
@@ -164,8 +164,10 @@ def test_rows_that_do_not_exist_and_arrays_that_do_not_fit(rng):
         bank.put(rows, Bank(3, (2,), capacity=8, backend="native"), rows)
     with pytest.raises(ModelError, match="1 to 256 states"):
         Bank(300, (2,), backend="native")
-    with pytest.raises(NumericalError, match="not positive definite"):
+    with pytest.raises(ModelError, match=r"R is not positive semidefinite at index \[0, 0\]"):
         bank.update(rows, np.zeros((3, 1)), H, None, -100.0 * R)
+    with pytest.raises(ModelError, match=r"Q is not positive semidefinite at index \[0, 0\]"):
+        bank.step(rows, trans, F, None, -Q)
 
 
 def test_other_types_and_strides(rng):

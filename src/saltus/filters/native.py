@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from saltus.compiled import native_module
 from saltus.errors import ModelError, SaltusError
-from saltus.filters.align import Aligned
+from saltus.filters.align import Aligned, covariances, finite
 from saltus.filters.backend import instruction_set, thread_count
 from saltus.filters.estimates import Estimates, allocate
 from saltus.filters.particles import Merged, Tables
@@ -170,19 +170,39 @@ class NativeStore:
         mode: _Modes | None = None,
     ) -> None:
         """Mix and propagate rows."""
-        self._lanes.step(
-            rows, trans, _looked_up(F, mode), None if b is None else _looked_up(b, mode), _looked_up(Q, mode)
-        )
+
+        def run(F: _Array, b: _Array | None, Q: _Array) -> int:
+            drift = None if b is None else _looked_up(b, mode)
+            return int(self._lanes.step(rows, trans, _looked_up(F, mode), drift, _looked_up(Q, mode)))
+
+        if run(F, b, Q) == _DOUBTFUL:
+            for c, t in enumerate(trans):
+                finite(f"trans[{c}]", 0.0 if t is None else t)
+            if (
+                run(finite("F", F), None if b is None else finite("b", b), covariances("Q", finite("Q", Q)))
+                == _DOUBTFUL
+            ):
+                raise ModelError("Q is not positive semidefinite. Give covariances, never factors or precisions.")
 
     def measure(
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, mode: _Modes | None = None, *, write: bool
     ) -> tuple[_Array, _Array]:
         """Return d2 and log f(z); condition the rows when `write`."""
         d2, log_f = np.empty(len(rows)), np.empty(len(rows))
-        by_mode = _looked_up(H, mode), None if d is None else _looked_up(d, mode), _looked_up(R, mode)
-        fault = self._lanes.measure(rows, write, z, *by_mode, d2, log_f)
+
+        def run(H: _Array, d: _Array | None, R: _Array) -> _Modes:
+            offset = None if d is None else _looked_up(d, mode)
+            return np.array(
+                self._lanes.measure(rows, write, z, _looked_up(H, mode), offset, _looked_up(R, mode), d2, log_f)
+            )
+
+        fault = run(H, d, R)
+        if fault[0] == _DOUBTFUL:
+            fault = run(finite("H", H), None if d is None else finite("d", d), covariances("R", finite("R", R)))
+        if fault[0] == _DOUBTFUL:
+            raise ModelError("R is not positive semidefinite. Give covariances, never factors or precisions.")
         if fault[0]:
-            raise _refusal(np.array(fault), z, len(rows) - 1)
+            raise _refusal(fault, z, len(rows) - 1)
         return d2, log_f
 
     def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]:

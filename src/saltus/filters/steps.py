@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from saltus.filters.refusals import NotPositive, check_evidence, place
-from saltus.linalg import cholesky, normalised, symmetric
+from saltus.linalg import NOTHING, cholesky, normalised, symmetric
 from saltus.shapes import Bool, Float
 
 __all__ = [
@@ -246,7 +246,7 @@ def _sweep(
 ) -> _Swept:
     """Take the first m rows out of all after them, one after the other, and their share out of `left`."""
     m = seen.shape[-1]
-    dead = _ROUNDING**2 * np.sum(np.square(rows[..., :m, :]), axis=-1)
+    dead = np.maximum(_ROUNDING**2 * np.sum(np.square(rows[..., :m, :]), axis=-1), NOTHING)
     d2, logdet, empty = np.zeros(left.shape[:-1]), np.zeros(left.shape[:-1]), []
     for a in range(m):
         c, nu, on = rows[..., 0, :], left[..., 0], seen[..., a]
