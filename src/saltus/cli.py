@@ -172,6 +172,24 @@ def track(
 
 @main.command()
 @click.argument("inputs", nargs=-1, required=True, type=_FILE)
+@click.option("-o", "--output", required=True, type=_FILE, help="TOML file to write.")
+@click.option("--config", type=_FILE, help="TOML file: what it says goes before what is learnt.")
+@click.option("--date", help="Date of the recording, YYYY-MM-DD (ASTERIX carries only the time of day).")
+@_FRAMING
+@click.option(
+    "--identity", type=click.Choice(["use", "ignore"]), default="use", show_default=True, help="Codes of the plots."
+)
+def setup(
+    inputs: tuple[Path, ...], output: Path, config: Path | None, date: str | None, framing: str | None, identity: str
+) -> None:
+    """Learn noise, update periods and backgrounds from the start of recordings, as a file that --config reads."""
+    from saltus.run import setup_files
+
+    setup_files(inputs, output, config, date, identity, framing=framing)
+
+
+@main.command()
+@click.argument("inputs", nargs=-1, required=True, type=_FILE)
 @click.option("-o", "--output", required=True, type=_FILE, help="File to write: .parquet, .csv or .jsonl.")
 @click.option("--category", "categories", multiple=True, type=click.IntRange(0, 255), help="Only this category.")
 @click.option("--items", multiple=True, help="Only these items, as 040,070/MODE3A or I048/250.")

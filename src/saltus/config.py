@@ -24,6 +24,7 @@ system = "platform"               # optional: sources of one system make common 
 [editions]
 21 = "0.23"                       # category = edition; others are guessed
 
+[learnt]                          # written by saltus setup: what was learnt from reports
 [reading]                         # fields of saltus.io.ReadingSettings
 [setup]                           # fields of saltus.tracks.settings.SetupSettings
 [tracker]                         # fields of saltus.tracks.settings.TrackerSettings
@@ -38,7 +39,7 @@ import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, TypeVar, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
@@ -123,6 +124,13 @@ class SensorConfig(BaseModel):
         return (self.sac, self.sic) == (system.sac, system.sic) and self.category in (None, system.category)
 
 
+class Learnt(NamedTuple):
+    """What a file holds of an earlier run's setup; `saltus.engine` knows what it means."""
+
+    path: str
+    table: dict[str, Any]
+
+
 class Config(BaseModel):
     """Everything a configuration file says, checked."""
 
@@ -138,6 +146,7 @@ class Config(BaseModel):
     filter: FilterSettings = Field(default_factory=FilterSettings)
     systems: SystemsSettings = Field(default_factory=SystemsSettings)
     registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
+    learnt: Learnt | None = None
 
     def site_for(self, system: System) -> SensorConfig | None:
         """The sensor of a system; one that names the category goes before one that does not."""
@@ -177,6 +186,10 @@ def _load(path: Path | str) -> Config:
         "sensor": _sensors(path, content.get("sensor", [])),
         "editions": _editions(path, content.get("editions", {})),
     }
+    if "learnt" in content:
+        if not isinstance(content["learnt"], Mapping):
+            raise ModelError(f"{path}: learnt = {brief(content['learnt'])}: saltus setup writes the table [learnt].")
+        values["learnt"] = Learnt(shown(str(path)), dict(content["learnt"]))
     if "date" in content:
         values["date"] = _date(path, content["date"])
     if "framing" in content:

@@ -7,7 +7,7 @@ import numpy as np
 
 from saltus.errors import DataError
 
-__all__ = ["parse_time", "time_window"]
+__all__ = ["parse_time", "time_window", "utc"]
 
 _DAY = 86400.0  # s
 
@@ -36,14 +36,15 @@ def time_window(time_from: str | None, time_to: str | None, start: float, end: f
     first = start if time_from is None else read(time_from, start)
     last = end if time_to is None else read(time_to, first)
     if first > last and time_from is not None and time_to is not None:
-        raise DataError(f"--from {time_from} is after --to {time_to}: {_utc(first)} and {_utc(last)} (UTC).")
+        raise DataError(f"--from {time_from} is after --to {time_to}: {utc(first)} and {utc(last)} (UTC).")
     if first > last or first > end or last < start:
         raise DataError(
-            f"every report is outside time window {_utc(first)} to {_utc(last)}: the recording lasts from "
-            f"{_utc(start)} to {_utc(end)} (UTC). Give --from and --to inside it, as HH:MM:SS or 2023-05-02T08:00:00."
+            f"every report is outside time window {utc(first)} to {utc(last)}: the recording lasts from "
+            f"{utc(start)} to {utc(end)} (UTC). Give --from and --to inside it, as HH:MM:SS or 2023-05-02T08:00:00."
         )
     return first, last
 
 
-def _utc(seconds: float) -> str:
+def utc(seconds: float) -> str:
+    """Write UTC seconds for people."""
     return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S")

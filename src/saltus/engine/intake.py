@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.records import REASONS, Plots
+from saltus.records import REASONS, Plots, Source
 
-__all__ = ["Arrived", "Intake", "Leap", "joined_plots"]
+__all__ = ["Arrived", "Intake", "Leap", "joined_plots", "numbered"]
 
 _Index = npt.NDArray[np.int64]
 
@@ -39,6 +39,21 @@ def joined_plots(parts: Sequence[Plots]) -> Plots:
     """Join reports whose sources and files are numbered alike; the last part names them."""
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Plots.column_names()}
     return Plots(parts[-1].sources, parts[-1].files, **columns)
+
+
+def numbered(index: npt.NDArray[np.int32], names: Sequence[Any], known: list[Any]) -> _Index:
+    """Number what reports name, sources or files, as `known` does; what is new goes behind, as it first occurs."""
+    of = np.full(len(names) + 1, -1)
+    values, first = np.unique(index, return_index=True)
+    for k in values[np.argsort(first)].tolist():
+        if k >= 0:
+            key = names[k].system if isinstance(names[k], Source) else names[k]
+            keys = [n.system if isinstance(n, Source) else n for n in known]
+            if key not in keys:
+                known.append(names[k])
+                keys.append(key)
+            of[k] = keys.index(key)
+    return np.asarray(of[index], np.int64)
 
 
 class Intake:

@@ -11,12 +11,13 @@ import pyarrow as pa
 
 from saltus.config import Config, load_config
 from saltus.engine.checkpoint import load_checkpoint, save_checkpoint
-from saltus.engine.intake import Arrived, Intake, Leap
+from saltus.engine.intake import Arrived, Intake, Leap, numbered
 from saltus.engine.journal import Journal
 from saltus.engine.learn import first_setup, usable, with_new_sources
 from saltus.engine.local import LocalTracking
 from saltus.engine.news import News, no_identifications
 from saltus.engine.result import Result, finished
+from saltus.engine.saved import refuse_another, saved_setup
 from saltus.engine.setup import Setup, site_of
 from saltus.engine.stored import config_from, setup_from, setup_state, source_from, source_words
 from saltus.engine.stretch import Stretch
@@ -65,8 +66,7 @@ class Session:
             folder: of the journal; None: a temporary one.
         """
         self._begin(setup.config, setup.use_identity, {}, hold, folder, Progress())
-        self._sources.extend(s.source for s in setup.sensors)
-        self._adopt(setup)
+        self._take_setup(setup)
 
     @classmethod
     def open(
@@ -82,7 +82,8 @@ class Session:
         """Begin without a setup: it is learnt from the first stretch of reports, which is then tracked under it.
 
         Args:
-            config: what is known beforehand, or the TOML file that says it.
+            config: what is known beforehand, or the TOML file that says it; one that `saltus setup` wrote holds a
+                setup, and nothing is learnt.
             use_identity: whether addresses and codes count.
             periods: update period of each source that its reader tells, by designation, s.
             hold: s that a report may come late; 0: reports come in order of time.
@@ -91,8 +92,18 @@ class Session:
         """
         session = cls.__new__(cls)
         known = config if isinstance(config, Config) else load_config(config)
+        setup = saved_setup(known, use_identity=use_identity)
+        known = known.model_copy(update={"learnt": None})
         session._begin(known, use_identity, periods or {}, hold, folder, bar or Progress())
+        if setup is not None:
+            session._take_setup(setup)
         return session
+
+    def _take_setup(self, setup: Setup) -> None:
+        """Begin with a setup that was learnt before."""
+        self._sources.extend(s.source for s in setup.sensors)
+        self._own_setup = False
+        self._adopt(setup)
 
     def _begin(
         self,
@@ -114,11 +125,17 @@ class Session:
         self._news = News()
         self.notes: dict[str, Any] = {}  # what the caller of `save` wanted to find again
         self._ended = False
+        self._own_setup = True  # learnt from these reports, or found to fit them
 
     @property
     def reports(self) -> int:
         """How many reports were fed."""
         return self._n
+
+    @property
+    def learnt(self) -> bool:
+        """Whether there is a setup."""
+        return bool(self._setups)
 
     @property
     def setup(self) -> Setup:
@@ -139,7 +156,7 @@ class Session:
             tracks: another centre's tracks up to now, with the columns of `Recording.tracks`.
 
         Raises:
-            DataError: the session has ended, or no report can be placed.
+            DataError: the session has ended, no report can be placed, or the setup is one of another place.
         """
         if self._ended:
             raise DataError("the session has ended; open another one.")
@@ -147,8 +164,23 @@ class Session:
             self._journal.append("foreign", _foreign_columns(tracks))
         plots, number = self._entered(reports)
         good = plots.reason == 0
+        if not self._own_setup and good.any():
+            refuse_another(self.setup, plots.take(good))
+            self._own_setup = True
         self._arrived(self._intake.add(plots.take(good), number[good]))
         return self._published()
+
+    def settle(self) -> Setup:
+        """Return the setup, learnt from the reports so far if there was none: the first stretch ends.
+
+        Raises:
+            DataError: none of them is usable, or the session has ended.
+        """
+        if self._ended:
+            raise DataError("the session has ended; open another one.")
+        if not self._setups:
+            self._learn()
+        return self.setup
 
     def finish(self) -> Result:
         """End the session; return everything, known after the fact.
@@ -181,8 +213,8 @@ class Session:
 
     def _entered(self, reports: Plots) -> tuple[Plots, _Index]:
         """Number reports, their sources and files as the session does, and note them."""
-        source = self._numbered(reports.source, reports.sources, self._sources)
-        file = self._numbered(reports.file, reports.files, self._files)
+        source = numbered(reports.source, reports.sources, self._sources)
+        file = numbered(reports.file, reports.files, self._files)
         plots = replace(
             reports,
             sources=tuple(self._sources),
@@ -199,21 +231,6 @@ class Session:
         self._journal.append("reports", {name: getattr(plots, name) for name in names})
         self._news.enter(plots, number)
         return plots, number
-
-    @staticmethod
-    def _numbered(index: npt.NDArray[np.int32], names: tuple[Any, ...], known: list[Any]) -> _Index:
-        """Number what reports name in the order in which it first occurs."""
-        of = np.full(len(names) + 1, -1)
-        values, first = np.unique(index, return_index=True)
-        for k in values[np.argsort(first)].tolist():
-            if k >= 0:
-                key = names[k].system if isinstance(names[k], Source) else names[k]
-                keys = [n.system if isinstance(n, Source) else n for n in known]
-                if key not in keys:
-                    known.append(names[k])
-                    keys.append(key)
-                of[k] = keys.index(key)
-        return np.asarray(of[index], np.int64)
 
     def _arrived(self, arrived: Arrived) -> None:
         """Track what the intake lets go, or learn the setup from it first."""
@@ -276,7 +293,7 @@ class Session:
         if source >= len(setup.sensors):
             setup = with_new_sources(setup, self._sources[: source + 1], time, self._periods)
         sensors = list(setup.sensors)
-        sensors[source] = replace(sensors[source], heard=True)
+        sensors[source] = replace(sensors[source], heard=True, appeared=time)
         self._adopt(replace(setup, time=time, sensors=tuple(sensors)))
 
     def _tell(self, own: int, fed: Fed) -> None:
@@ -328,6 +345,7 @@ class Session:
             "hold": self._hold,
             "sources": [source_words(s) for s in self._sources],
             "files": self._files,
+            "own_setup": self._own_setup,
             "reports": self._n,
             "setups": [words for _, words in setups],
             "leaps": [leap._asdict() for leap in self._intake.leaps],
@@ -350,7 +368,7 @@ class Session:
         session.notes = words["notes"]
         session._sources.extend(source_from(s) for s in words["sources"])
         session._files.extend(words["files"])
-        session._n = int(words["reports"])
+        session._n, session._own_setup = int(words["reports"]), bool(words["own_setup"])
         for k, told in enumerate(words["setups"]):
             session._setups.append(setup_from(state["setup"].get(str(k), {}), told))
         like = Plots.build(0, tuple(session._sources), tuple(session._files), {})

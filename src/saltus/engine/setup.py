@@ -39,6 +39,7 @@ class SensorSetup:
     noise: Noise  # used
     estimate: NoiseEstimate  # found in the first stretch
     background: Background
+    appeared: float = float("nan")  # s: when it first reported, where that was after the setup was learnt
 
     def of_tracker(self) -> SourceSetup:
         """What a tracker is told of it."""

@@ -15,7 +15,7 @@ from saltus.tracks.background import Background
 from saltus.tracks.measurements import Noise
 from saltus.tracks.noise import NoiseEstimate
 
-__all__ = ["config_from", "setup_from", "setup_state", "source_from", "source_words"]
+__all__ = ["config_from", "sensor_words", "setup_from", "setup_state", "source_from", "source_words"]
 
 
 def source_words(source: Source) -> dict[str, Any]:
@@ -35,7 +35,7 @@ def setup_state(setup: Setup) -> tuple[dict[str, Any], dict[str, Any]]:
         "use_identity": setup.use_identity,
         "time": setup.time,
         "plane": [setup.plane.latitude, setup.plane.longitude],
-        "sensors": [_sensor_words(s) for s in setup.sensors],
+        "sensors": [sensor_words(s) for s in setup.sensors],
     }
     arrays = {str(k): _background_arrays(s.background) for k, s in enumerate(setup.sensors)}
     return arrays, words
@@ -57,7 +57,8 @@ def config_from(words: Mapping[str, Any]) -> Config:
     return Config.model_validate_json(json.dumps(words))
 
 
-def _sensor_words(sensor: SensorSetup) -> dict[str, Any]:
+def sensor_words(sensor: SensorSetup) -> dict[str, Any]:
+    """Return a sensor as words, without its background."""
     plain = {f.name: getattr(sensor, f.name) for f in fields(sensor)}
     del plain["background"]
     site = None if sensor.site is None else asdict(sensor.site)

@@ -20,7 +20,7 @@ from saltus.errors import DataError
 from saltus.progress import Progress
 from saltus.records import Recording
 
-__all__ = ["Feeding", "fingerprint", "follow"]
+__all__ = ["Feeding", "fingerprint", "follow", "told_periods"]
 
 _CHUNK, _OFTEN = 50_000, 1_000  # reports fed at a time, and where states are saved in between
 
@@ -116,7 +116,7 @@ def _session(
         begin_anew(folder)
         if feeding.resume:
             lines.append(f"{folder} holds no state yet: begun from the first report.")
-    periods = _periods(recording)
+    periods = told_periods(recording)
     session = Session.open(config, use_identity=use_identity, periods=periods, hold=0.0, folder=folder, bar=bar)
     return session, lines
 
@@ -133,8 +133,8 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     return out
 
 
-def _periods(recording: Recording) -> dict[str, float]:
-    """Update period of each source that the readers tell, s."""
+def told_periods(recording: Recording) -> dict[str, float]:
+    """Return the update period of each source that the readers tell, s."""
     found: dict[str, list[float]] = {}
     for line in recording.contents:
         if np.isfinite(line.update_period) and line.update_period > 0:

@@ -5,7 +5,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from saltus.engine import Result, Setup
+from saltus.engine.learn import sigmas
 from saltus.records import REASONS, Plots, Source
+from saltus.times import utc
 
 __all__ = ["called", "nothing_left", "set_up", "without_tracks"]
 
@@ -24,6 +26,13 @@ def set_up(setup: Setup, unplaced: Mapping[int, int]) -> list[str]:
     for s, sensor in enumerate(setup.sensors):
         if unplaced.get(s):
             lines.append(site_wanted(sensor.source, unplaced[s]))
+        if np.isfinite(sensor.appeared) and set(field for _, field, _ in sigmas(sensor)) - set(sensor.given):
+            used = ", ".join(f"{label} {getattr(sensor.noise, f) * unit:.4g}" for label, f, unit in sigmas(sensor))
+            lines.append(
+                f"{sensor.name}: it first reported at {utc(sensor.appeared)}, after noise had been learnt: {used} "
+                "is used, whatever its reports say. Configure it in a [[sensor]] table, learn a setup (saltus setup) "
+                "from a time in which it reports, or make the first stretch longer ([setup] seconds)."
+            )
         if sensor.heard and np.isnan(sensor.told_period):
             lines.append(
                 f"{sensor.name}: the recording does not tell the update period; {sensor.period:.3g} s is assumed. "

@@ -1,0 +1,77 @@
+"""`saltus setup`: what is learnt from the first stretch of recordings, as a configuration for others."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from saltus import io
+from saltus.config import load_config
+from saltus.engine import SensorSetup, Session, Setup
+from saltus.engine.learn import sigmas
+from saltus.engine.saved import setup_toml
+from saltus.io.write import output_file, write_text
+from saltus.progress import progress_bar
+from saltus.run.follow import told_periods
+from saltus.text import say, shown
+
+__all__ = ["setup_files"]
+
+_CHUNK = 1_000  # reports fed at a time, until there are enough
+
+
+def setup_files(
+    inputs: Sequence[Path],
+    output: Path,
+    config_path: Path | None = None,
+    date: str | None = None,
+    identity: str = "use",
+    *,
+    framing: str | None = None,
+) -> Setup:
+    """Learn a setup from the first stretch of recordings and write it as a file that `--config` reads.
+
+    Args:
+        inputs: recordings; several are merged by time.
+        output: TOML file to write.
+        config_path: TOML configuration; it goes before what is learnt, and into the file.
+        date: YYYY-MM-DD of the recordings.
+        identity: "use" or "ignore" the codes that plots carry.
+        framing: of ASTERIX recordings.
+
+    Raises:
+        DataError: an input cannot be read, or no report can be placed.
+        ModelError: the configuration is wrong.
+    """
+    with progress_bar() as bar, output_file(output) as path:
+        config = load_config(config_path, date=date, framing=framing).model_copy(update={"learnt": None})
+        recording = io.read(
+            inputs,
+            date=config.date,
+            editions=config.editions,
+            framing=config.framing,
+            progress=bar.reading,
+            settings=config.reading,
+        )
+        session = Session.open(
+            config, use_identity=identity == "use", periods=told_periods(recording), hold=0.0, bar=bar
+        )
+        plots, start = recording.plots, 0
+        while start < len(plots) and not session.learnt:
+            session.feed(plots.take(slice(start, start + _CHUNK)))
+            start += _CHUNK
+        setup = session.settle()
+        write_text(path, setup_toml(setup, [shown(name) for name in plots.files]))
+    for problem in recording.problems:
+        say(f"note: {problem}")
+    for sensor in setup.sensors:
+        say(_line(sensor))
+    say(f"written to {shown(str(output))}; saltus track reads it with --config")
+    return setup
+
+
+def _line(sensor: SensorSetup) -> str:
+    """Say what was learnt of a sensor."""
+    used = ", ".join(f"{label} {getattr(sensor.noise, field) * unit:.4g}" for label, field, unit in sigmas(sensor))
+    said = "configured, told or learnt" if np.isfinite(sensor.told_period) else "assumed"
+    return f"{sensor.name}: {used}; update period {sensor.period:.4g} s ({said})"
