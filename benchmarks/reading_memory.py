@@ -24,6 +24,9 @@ FORM = layout(48, "1.32")
 WAYS = {
     "start of Python and Saltus": "from saltus.io import read; import saltus.io.asterix",
     "read: all reports in memory": "from saltus.io import read; n = len(read([path]).plots)",
+    "read_in_order: chunks in order of time": (
+        "from saltus.io import read_in_order; n = sum(len(r.plots) for r in read_in_order([path]))"
+    ),
     "saltus info --full": "from pathlib import Path; from saltus.info import show_info; show_info([path], full=True)",
     "saltus convert, to Parquet": (
         "from saltus.convert import convert_files; convert_files([path], path.with_suffix('.parquet'))"

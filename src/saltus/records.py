@@ -191,18 +191,19 @@ class Plots:
         taken: dict[str, Any] = {name: _taken(getattr(self, name), index, n) for name in self.column_names()}
         return replace(self, **taken)
 
-    def in_file(self, name: str) -> "Plots":
-        """The same reports as those of one file."""
-        return replace(self, files=(name,), file=_once(np.zeros(len(self), np.int32), len(self)))
-
     @classmethod
     def column_names(cls) -> list[str]:
         """Names of the per-report columns."""
         return [f.name for f in fields(cls) if f.name not in ("sources", "files")]
 
     @classmethod
-    def concat(cls, parts: list["Plots"]) -> "Plots":
-        """Join reports of several files; equal systems become one source."""
+    def concat(cls, parts: list["Plots"], *, same_files: bool = False) -> "Plots":
+        """Join reports; equal systems become one source.
+
+        Args:
+            parts: reports of files of their own, or all of the first one's.
+            same_files: they are of the same files.
+        """
         sources: list[Source] = []
         files: list[str] = []
         columns: dict[str, list[npt.NDArray[np.generic]]] = {name: [] for name in cls.column_names()}
@@ -211,12 +212,17 @@ class Plots:
             for name in columns:
                 columns[name].append(getattr(part, name))
             columns["source"][-1] = _once(source_idx[part.source] if len(part) else part.source, len(part))
-            columns["file"][-1] = _once(part.file + np.int32(len(files)), len(part))
-            files.extend(part.files)
+            if not same_files:
+                columns["file"][-1] = _once(part.file + np.int32(len(files)), len(part))
+                files.extend(part.files)
         n = sum(len(p) for p in parts)
         if not parts:
             return cls.build(0, (), (), {})
-        return cls(tuple(sources), tuple(files), **{name: _joined(columns.pop(name), n) for name in cls.column_names()})
+        return cls(
+            tuple(sources),
+            parts[0].files if same_files else tuple(files),
+            **{name: _joined(columns.pop(name), n) for name in cls.column_names()},
+        )
 
     def sorted_by_time(self) -> "Plots":
         """Return the reports in time order (stable)."""
@@ -288,6 +294,7 @@ class FileContents:
     framing: tuple[str, ...] = ()  # in words, what lies around its blocks
     passed: Mapping[str, int] = field(default_factory=dict)  # packets and frames passed over, by protocol
     channels: tuple[str, ...] = ()  # lines and connections that carried it
+    order: tuple[str, ...] = ()  # in words, which of its blocks are out of order of time, and by how much
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,7 @@
 """ASTERIX frames worked out by hand, for the tests of framing and of each category."""
 
+import struct
+
 # CAT048, one record of 28 bytes: SAC/SIC 20/129
 PLOT = bytes.fromhex(
     "30 001f"  # category 48, 3 + 28 bytes
@@ -25,3 +27,14 @@ def plot(*, tod=100.5, rho=2560, theta=0x4000, kind="a0", code="029c", level="01
         f"30001f fdc102 14{sic:02x} {round(tod * 128):06x} {kind} {rho:04x}{theta:04x} {code} {level} 3c6444"
         f"10c231820820 {state}"
     )
+
+
+def capture(payloads, *, start=1_700_000_000.0, step=1.0):
+    """A classic capture of UDP datagrams, one each step from start, s."""
+    data = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 1)
+    for k, payload in enumerate(payloads):
+        ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + len(payload), 0, 0, 64, 17, 0) + bytes([10, 0, 0, 1, 239, 1, 1, 1])
+        packet = bytes(12) + b"\x08\0" + ip + struct.pack(">HHHH", 4000, 8600, 8 + len(payload), 0) + payload
+        seconds, micro = divmod(round(1e6 * (start + k * step)), 10**6)
+        data += struct.pack("<IIII", seconds, micro, len(packet), len(packet)) + packet
+    return data

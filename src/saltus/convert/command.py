@@ -18,6 +18,7 @@ from saltus.convert.writers import check_suffix, open_writer
 from saltus.errors import DataError
 from saltus.io import format_of
 from saltus.io.blocks import Blocks
+from saltus.io.categories import CATEGORIES
 from saltus.io.columns import SOURCE
 from saltus.io.dating import Clock, Read, read_records
 from saltus.io.found import Found
@@ -133,7 +134,7 @@ def _first_pass(path: Path, config: Config, categories: Sequence[int], items: It
 
 
 def _read(found: Mapping[int, Found]) -> dict[int, Read]:
-    return {number: read_records(number, f) for number, f in found.items() if len(f)}
+    return {number: read_records(CATEGORIES[number], f) for number, f in found.items() if len(f)}
 
 
 def _layouts(met: Sequence[_Met]) -> dict[int, Layout]:

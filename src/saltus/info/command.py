@@ -124,6 +124,8 @@ def _file(file: FileContents) -> Table:
     if file.n_read < file.size:
         share = f"{file.n_read / file.size:.1%}"
         grid.add_row("read", Text(f"the first {_size(file.n_read)} of {_size(file.size)} ({share}); --full reads all"))
+    for words in file.order:
+        grid.add_row("order", Text(words))
     if file.channels:
         more = f", and {len(file.channels) - _CHANNELS} more" if len(file.channels) > _CHANNELS else ""
         grid.add_row("channels", Text(f"{len(file.channels)}: {', '.join(file.channels[:_CHANNELS])}{more}"))

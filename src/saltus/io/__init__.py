@@ -1,7 +1,7 @@
 """Recordings in: ASTERIX files, packet captures and tables become target reports as arrays."""
 
 import datetime
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,23 +11,13 @@ from saltus.io.inputs import expand
 from saltus.io.merge import merge
 from saltus.io.part import Part, printable
 from saltus.io.settings import ReadingSettings
+from saltus.io.told import Progress, Told
 from saltus.records import Recording
 from saltus.text import brief
 
-__all__ = ["FORMATS", "Format", "ReadingSettings", "Told", "format_of", "read", "read_part"]
+__all__ = ["FORMATS", "Format", "ReadingSettings", "Told", "format_of", "read", "read_in_order", "read_part"]
 
-Progress = Callable[[str, float], None]
 Reader = Callable[[Path, "Told", Progress | None], Part]
-
-
-class Told(NamedTuple):
-    """What is told of recordings that they do not tell themselves."""
-
-    date: datetime.date | None = None  # of the first record of ASTERIX files; past midnight counts on
-    editions: Mapping[int, str] = {}  # ASTERIX category -> edition, as "0.23"; categories not named are guessed
-    framing: str | None = None  # one of `saltus.framing.NAMES`; None has it guessed
-    settings: ReadingSettings = ReadingSettings()  # bounds of reading
-    most: int | None = None  # bytes read of an ASTERIX file, from the beginning; None = all
 
 
 class Format(NamedTuple):
@@ -99,6 +89,51 @@ def read(
         raise DataError("no input given: name at least one recording.")
     told = Told(date, editions or {}, framing, settings or ReadingSettings())
     return merge([read_part(path, told, progress) for path in expand(paths)])
+
+
+def read_in_order(
+    paths: Sequence[Path | str],
+    *,
+    date: datetime.date | None = None,
+    editions: Mapping[int, str] | None = None,
+    framing: str | None = None,
+    progress: Progress | None = None,
+    settings: ReadingSettings | None = None,
+) -> Iterator[Recording]:
+    """Read files and merge them by time as `read` does, a chunk at a time: memory does not grow with ASTERIX files.
+
+    Clocks are judged as the reports come, and what was given is not taken back: where a clock is set back for good,
+    its later reports are right as they are with `read`, but none of the earlier ones is marked for it. A recording
+    whose blocks are not in order of time is read from several places at once (`saltus.io.index`). Tables are held
+    whole.
+
+    Args:
+        paths: as `read`, like all others.
+        date: of the first record of ASTERIX files.
+        editions: ASTERIX category -> edition.
+        framing: of ASTERIX files.
+        progress: called with a file's name and the fraction read.
+        settings: bounds of reading; reports that wait for others take no more than `memory`.
+
+    Yields:
+        Recordings whose usable reports are in order of time from first to last; rejected ones come with the piece of
+        the file in which they lie. The last has no reports, but contents, problems and files of all.
+
+    Raises:
+        DataError: as `read`, or too many reports wait for others that come late.
+    """
+    from saltus.io.in_order import InOrder, asterix_runs, table_run
+
+    if not paths:
+        raise DataError("no input given: name at least one recording.")
+    told = Told(date, editions or {}, framing, settings or ReadingSettings())
+    indexed = [
+        table_run(read_part(path, told, progress), k)
+        if "table" in format_of(path, framing).name
+        else asterix_runs(path, k, told, progress)
+        for k, path in enumerate(expand(paths))
+    ]
+    yield from InOrder(indexed, told.settings.memory)
 
 
 def read_part(path: Path, told: Told, progress: Progress | None = None) -> Part:

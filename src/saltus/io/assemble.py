@@ -23,15 +23,18 @@ __all__ = ["Assembler"]
 class Assembler:
     """Turns the records of a recording, piece after piece, into target reports and lines of contents."""
 
-    def __init__(self, name: str, clock: Clock) -> None:
+    def __init__(self, name: str, clock: Clock, before: Mapping[int, int] | None = None) -> None:
         """Begin a recording.
 
         Args:
             name: of the file.
             clock: that dates its records.
+            before: records of each category before those that will be given.
         """
         self._name, self._clock = name, clock
-        self._before: Counter[int] = Counter()  # records of each category in the pieces before
+        self._before = Counter(before or {})  # records of each category in the pieces before
+        self.read: dict[int, Read] = {}  # of the last piece, and
+        self.times: dict[int, npt.NDArray[np.float64]] = {}  # the times of its records
         self._doubted = False  # the clock of the capture was found to be another
 
     def part(self, found: Mapping[int, Found], notes: Mapping[int, tuple[str, ...]], *, dated: bool) -> Part:
@@ -43,8 +46,9 @@ class Assembler:
             dated: the clocks of all blocks tell the date.
         """
         name, clock = self._name, self._clock
-        read = {number: read_records(number, records) for number, records in found.items() if len(records)}
+        read = {number: read_records(CATEGORIES[number], records) for number, records in found.items() if len(records)}
         times = clock.times(read, dated=dated)
+        self.read, self.times = read, times
         problems: list[str] = []
         if clock.captured and read and not self._doubted:
             captured = np.concatenate([r.found.clock for r in read.values()])
@@ -62,7 +66,7 @@ class Assembler:
             contents += _lines(name, number, r, times[number], part, turns, notes[number])
         with_reports = [p for p in plots if len(p)] or plots[:1]
         return Part(
-            Plots.concat(with_reports).in_file(name),
+            Plots.concat(with_reports, same_files=True) if with_reports else Plots.build(0, (), (name,), {}),
             pa.concat_tables(tracks) if tracks else None,
             tuple(contents),
             tuple(problems),

@@ -10,6 +10,7 @@ cannot be told apart, so it counts as no record, and a problem names its byte.
 
 import datetime
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +22,14 @@ from saltus.io.assemble import Assembler
 from saltus.io.blocks import Blocks
 from saltus.io.dating import Clock
 from saltus.io.found import Found
+from saltus.io.index import block_times, index_blocks
 from saltus.io.part import Part, join_parts
 from saltus.io.sheet import refuse_size
 from saltus.io.stream import Stream
+from saltus.io.stretches import Stretches, order_words
 from saltus.records import Contents, FileContents, Plots, System
 
-__all__ = ["read_asterix", "read_pieces"]
+__all__ = ["about_file", "index_blocks", "pieces_of", "read_asterix", "read_pieces", "told_dateless"]
 
 PER_REPORT = 250.0  # bytes that a report takes until it is merged, measured; see docs/formats.md
 _TOLD = 8  # problems of one kind told one by one
@@ -60,12 +63,12 @@ def read_asterix(
     stream = Stream(path, editions, framing)
     parts: list[Part] = []
     n = 0
-    for part in _pieces(stream, date, most, progress):
+    for part in pieces_of(stream, date, most=most, progress=progress):
         n += len(part.plots)
         refuse_size(path, n * PER_REPORT, memory, f"more than {n} reports")
         parts.append(part)
     if stream.changed:  # now that all is known of its editions
-        parts = list(_pieces(Stream(path, editions, framing, stream.chosen), date, most, progress))
+        parts = list(pieces_of(Stream(path, editions, framing, stream.chosen), date, most=most, progress=progress))
     return join_parts(parts)
 
 
@@ -91,43 +94,67 @@ def read_pieces(
     Yields:
         Pieces with records, and last a part without reports: what could not be read, and how the file is framed.
     """
-    return _pieces(Stream(path, editions, framing), date, most, progress)
+    return pieces_of(Stream(path, editions, framing), date, most=most, progress=progress)
 
 
-def _pieces(
+def pieces_of(
     stream: Stream,
     date: datetime.date | None,
-    most: int | None,
-    progress: Callable[[str, float], None] | None,
+    *,
+    most: int | None = None,
+    blocks: tuple[int, int] | None = None,
+    before: Mapping[int, int] | None = None,
+    progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[Part]:
+    """Read a recording whose editions may be chosen already, or the blocks from one number up to another.
+
+    Args:
+        stream: the recording, not begun.
+        date: of the first record read.
+        most: bytes read.
+        blocks: number of the first block read, and of the first that is not; None = all.
+        before: records of each category before the first block read.
+        progress: called with the file's name and the fraction read.
+
+    Yields:
+        As `read_pieces`.
+    """
     path, name = stream.path, stream.path.name
     if not path.stat().st_size:
         raise DataError(f"{path}: byte 0: the file is empty.")
-    clock, broken = Clock(date, name), _Broken(name)
-    assembler = Assembler(name, clock)
+    clock, broken, order = Clock(date, name), _Broken(name), Stretches()
+    assembler = Assembler(name, clock, before)
     first: dict[int, int] = {}  # byte of the first block of each category
     empty = True
-    for piece in stream.pieces(most=most, progress=progress):
-        for number, (blocks, _) in piece.items():
-            first.setdefault(number, int(blocks.at[0]))
+    for piece in stream.pieces(most=most, blocks=blocks, progress=progress):
+        for number, (some, _) in piece.items():
+            first.setdefault(number, int(some.at[0]))
         found = stream.records(piece)
         for number, held in found.items():
             broken.add(piece[number][0], held)
         if any(len(f) for f in found.values()):
             empty = False
             notes = {n: (c.note,) if c.note else () for n, c in stream.chosen.items()}
-            yield assembler.part(found, notes, dated=all(blocks.dated for blocks, _ in piece.values()))
+            part = assembler.part(found, notes, dated=all(some.dated for some, _ in piece.values()))
+            index = block_times(piece, assembler.read, assembler.times)
+            order.add(index.at, index.time, index.category.astype(np.int64) << 16 | index.source)
+            yield part
     unread = {n: f"{stream.n_blocks[n]} blocks; {c.note}" for n, c in sorted(stream.chosen.items()) if not c.edition}
     problems = _problems(name, stream, unread, first, broken)
     if not empty and clock.dateless:
-        problems.append(f"{name}: no date given: times count from 1970-01-01; give --date YYYY-MM-DD.")
+        problems.append(told_dateless(name))
     if empty and not unread:
         said = f" {problems[0]}" if problems else ""
         raise DataError(f"{path}: no ASTERIX record could be read: wrong format, category or edition?{said}")
     lines = tuple(_unread(name, number, note) for number, note in unread.items())
     problems += clock.problems
-    about = _about(path, stream.told, most)
-    yield Part(Plots.build(0, (), (name,), {}), None, lines, tuple(problems), True, clock.captured, about)
+    file = replace(about_file(path, stream.told, most), order=order_words(order.finish()))
+    yield Part(Plots.build(0, (), (name,), {}), None, lines, tuple(problems), True, clock.captured, file)
+
+
+def told_dateless(name: str) -> str:
+    """That a recording tells no date."""
+    return f"{name}: no date given: times count from 1970-01-01; give --date YYYY-MM-DD."
 
 
 class _Broken:
@@ -164,7 +191,7 @@ def _problems(
     return problems + broken.texts()
 
 
-def _about(path: Path, told: Told, most: int | None) -> FileContents:
+def about_file(path: Path, told: Told, most: int | None) -> FileContents:
     """How the file is framed, in words."""
     size = path.stat().st_size
     others = ", ".join(f"{g.name} {g.share:.0%}" for g in told.guesses[1:] if g.share >= 0.005)

@@ -1,6 +1,7 @@
 """Times of day to times, and the reports whose time cannot be right."""
 
 from collections import deque
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from saltus.shapes import Float, Int
 __all__ = [
     "DAY",
     "SORTING_WINDOW",
+    "ClockJudge",
     "OrderFaults",
     "complete",
     "day_offsets",
@@ -162,48 +164,73 @@ def order_faults(time: Float[np.ndarray, " n"]) -> OrderFaults:
     Args:
         time: (N,) s, finite.
     """
-    n = len(time)
-    late, jump = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
-    steps: list[int] = []
-    sizes: list[float] = []
-    behind = np.maximum.accumulate(time) - time if n else time
-    if not np.any(behind > SORTING_WINDOW) and not np.any(np.diff(time[-4:]) > _LONE):
-        return OrderFaults(late, jump, (), (), *_leaps(time, late))
-    mark, leap, before = -np.inf, 0, np.inf  # watermark; last leap ahead: where, and the watermark before it
-    resumed = 0  # where the clock goes on after a passing step back
-    for k in range(n):
-        if k < resumed:
-            continue
-        t = float(time[k])
-        if t >= mark - SORTING_WINDOW:
-            if t > mark + SORTING_WINDOW:
-                if _stands_alone(time, k, mark):
-                    jump[k] = True
-                    continue
-                if t > mark + _WILD and np.isfinite(mark):
-                    leap, before = k, mark
-            mark = max(mark, t)
-            continue
-        ahead = time[k : k + _FOR_GOOD]
-        lasting = len(ahead) >= _AHEAD and np.mean(ahead < mark - SORTING_WINDOW) >= 0.9
-        if lasting and abs(t - np.median(ahead[:_AHEAD])) < _WILD:
-            if t >= before - SORTING_WINDOW and k - leap <= _EXCURSION:
-                jump[leap:k] = True
-                mark = max(before, t)
-            elif resumed := _goes_on(time, k, mark):
-                jump[k:resumed] = True
-                continue
-            else:
-                steps.append(k)
-                sizes.append(mark - t)
-                mark = t
-            before = np.inf
-        elif mark - t > _WILD:
-            jump[k] = True
+    return ClockJudge().faults(time)
+
+
+@dataclass(slots=True)
+class ClockJudge:
+    """Judges the times of one source in the order received, a piece at a time: what was judged is not taken back."""
+
+    mark: float = -np.inf  # the newest credible time
+    before: float = np.inf  # the newest before the last leap ahead, and
+    leap: int = 0  # where that leap is, from the beginning of the piece
+
+    def faults(self, time: Float[np.ndarray, " n"]) -> OrderFaults:
+        """Judge the next times by the rule of `order_faults`."""
+        n = len(time)
+        late, jump = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        steps: list[int] = []
+        sizes: list[float] = []
+        newest = np.maximum.accumulate(np.append(self.mark, time))[1:]
+        if np.any(newest - time > SORTING_WINDOW) or np.any(np.diff(time[-4:]) > _LONE):
+            self._go(time, late, jump, steps, sizes)
+            _mark_repeated(time, late, jump, steps)
         else:
-            late[k] = True
-    _mark_repeated(time, late, jump, steps)
-    return OrderFaults(late & ~jump, jump, tuple(steps), tuple(sizes), *_leaps(time, late | jump))
+            self.mark = float(newest[-1]) if n else self.mark
+        self.leap -= n
+        return OrderFaults(late & ~jump, jump, tuple(steps), tuple(sizes), *_leaps(time, late | jump))
+
+    def _go(
+        self,
+        time: npt.NDArray[np.float64],
+        late: npt.NDArray[np.bool_],
+        jump: npt.NDArray[np.bool_],
+        steps: list[int],
+        sizes: list[float],
+    ) -> None:
+        """Mark what is late, what jumps, and where the clock steps back for good."""
+        resumed = 0  # where the clock goes on after a passing step back
+        for k in range(len(time)):
+            if k < resumed:
+                continue
+            t = float(time[k])
+            if t >= self.mark - SORTING_WINDOW:
+                if t > self.mark + SORTING_WINDOW:
+                    if _stands_alone(time, k, self.mark):
+                        jump[k] = True
+                        continue
+                    if t > self.mark + _WILD and np.isfinite(self.mark):
+                        self.leap, self.before = k, self.mark
+                self.mark = max(self.mark, t)
+                continue
+            ahead = time[k : k + _FOR_GOOD]
+            lasting = len(ahead) >= _AHEAD and np.mean(ahead < self.mark - SORTING_WINDOW) >= 0.9
+            if lasting and abs(t - np.median(ahead[:_AHEAD])) < _WILD:
+                if t >= self.before - SORTING_WINDOW and k - self.leap <= _EXCURSION:
+                    jump[max(self.leap, 0) : k] = True
+                    self.mark = max(self.before, t)
+                elif resumed := _goes_on(time, k, self.mark):
+                    jump[k:resumed] = True
+                    continue
+                else:
+                    steps.append(k)
+                    sizes.append(self.mark - t)
+                    self.mark = t
+                self.before = np.inf
+            elif self.mark - t > _WILD:
+                jump[k] = True
+            else:
+                late[k] = True
 
 
 def _goes_on(time: npt.NDArray[np.float64], k: int, mark: float) -> int:

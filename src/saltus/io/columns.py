@@ -1,7 +1,8 @@
 """The wanted items of one category's records as columns, and what a category makes of them."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,18 @@ from saltus.asterix.codec import Column, Data, Records, Want, decode
 from saltus.asterix.layout import SI, Layout
 from saltus.records import REASONS, Traits
 
-__all__ = ["SOURCE", "Category", "Columns", "Decoded", "first_reason", "read_columns", "status", "validated"]
+__all__ = [
+    "SOURCE",
+    "Category",
+    "Columns",
+    "Decoded",
+    "first_reason",
+    "read_columns",
+    "status",
+    "time_of_day",
+    "times_of",
+    "validated",
+]
 
 SOURCE = "010"  # the item that names the source, in every category
 Numbers = npt.NDArray[np.float64]
@@ -33,25 +45,31 @@ class Decoded(NamedTuple):
     steps: Mapping[str, float]  # quantisation: fields of Source
     site: tuple[Numbers, Numbers, Numbers] | None = None  # told by the source: latitude, longitude, rad, height, m
     tracks: pa.Table | None = None  # columns of another system's tracks, one row for each record
-    time_modulus: float = 0.0  # s: times of day are given modulo this; 0 = whole
 
 
 @dataclass(frozen=True, slots=True)
 class Category:
     """What to take from the records of one category, and how to read it.
 
-    `words` say what its sources are. `fields` are the paths taken (those that an edition does not have stay absent);
+    `words` say what its sources are. `time` are the paths that tell the time of day, the best last. `fields` are
+    the paths taken (those that an edition does not have stay absent);
     `decode` makes sense of them. `traits` are those of every source of the category; that one rotates is told by its
     reports. `turns` is the category of the service messages that tell the update cycle of its sources.
     """
 
     number: int
     words: str
+    time: tuple[str, ...]
     fields: tuple[str | Want, ...]
     decode: Callable[["Columns"], Decoded]
     traits: Traits = Traits()
     turns: int | None = None
     counted: bool = False  # no target reports are taken
+    time_modulus: float = 0.0  # s: times of day are given modulo this; 0 = whole
+
+    def timed(self) -> "Category":
+        """The same category of which the times alone are taken."""
+        return replace(self, fields=self.time, decode=partial(times_of, self.time))
 
 
 class Columns:
@@ -128,6 +146,21 @@ def first_reason(n: int, cases: Mapping[str, Mask]) -> npt.NDArray[np.int8]:
     for text, holds in reversed(list(cases.items())):
         reason[holds] = REASONS.index(text)
     return reason
+
+
+def time_of_day(c: "Columns", paths: tuple[str, ...]) -> Numbers:
+    """Time of day of each record, s, from the best item that it has, (N,)."""
+    time = np.full(c.n, np.nan)
+    for path in paths:
+        given = c.number(path)
+        time = np.where(np.isnan(given), time, given)
+    return time
+
+
+def times_of(paths: tuple[str, ...], c: "Columns") -> Decoded:
+    """Records of which only the times are taken."""
+    none = np.full(c.n, -1, np.int64)
+    return Decoded(time_of_day(c, paths), none > 0, none, {}, {}, none > 0, {})
 
 
 def status(

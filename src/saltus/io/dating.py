@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from saltus.io.categories import CATEGORIES
 from saltus.io.clock import DAY, complete, day_offsets, impossible
-from saltus.io.columns import SOURCE, Decoded
+from saltus.io.columns import SOURCE, Category, Decoded
 from saltus.io.found import Found
 from saltus.records import REASONS, System
 
@@ -23,20 +23,21 @@ _TAIL = 15  # times of day that tell the day of the next
 class Read:
     """What became of the records of one category."""
 
+    category: Category
     found: Found
     decoded: Decoded
     systems: list[System]
     system_of: npt.NDArray[np.int64]  # of each record
 
 
-def read_records(number: int, found: Found) -> Read:
+def read_records(category: Category, found: Found) -> Read:
     """What becomes of the records of a category."""
     first, stop = found.columns.spans(SOURCE).T
     octets = found.data
     word = octets[first].astype(np.int64) << 8 | octets[np.minimum(first + 1, stop - 1)]
     values, which = np.unique(word, return_inverse=True)
-    systems = [System(number, int(v) >> 8, int(v) & 255) for v in values]
-    return Read(found, _possible(CATEGORIES[number].decode(found.columns)), systems, which.astype(np.int64))
+    systems = [System(category.number, int(v) >> 8, int(v) & 255) for v in values]
+    return Read(category, found, _possible(category.decode(found.columns)), systems, which.astype(np.int64))
 
 
 def _possible(decoded: Decoded) -> Decoded:
@@ -144,7 +145,7 @@ class Clock:
     def _time_of_day(self, number: int, read: Mapping[int, Read]) -> npt.NDArray[np.float64]:
         """Times of day of a category; truncated ones are completed, or become NaN, and are counted."""
         r = read[number]
-        modulus = r.decoded.time_modulus
+        modulus = r.category.time_modulus
         if not modulus:
             return r.decoded.time_of_day
         time = complete(r.decoded.time_of_day, modulus, self._reference(number, read))

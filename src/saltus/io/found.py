@@ -8,8 +8,7 @@ import numpy.typing as npt
 from saltus.asterix.codec import Faults, Records, find_records
 from saltus.asterix.layout import Layout, layout
 from saltus.io.blocks import Blocks
-from saltus.io.categories import CATEGORIES
-from saltus.io.columns import Columns, read_columns
+from saltus.io.columns import Category, Columns, read_columns
 
 __all__ = ["Found", "find"]
 
@@ -33,17 +32,17 @@ class Found:
         return len(self.sequence)
 
 
-def find(number: int, edition: str, blocks: Blocks, place: npt.NDArray[np.int64]) -> Found:
+def find(category: Category, edition: str, blocks: Blocks, place: npt.NDArray[np.int64]) -> Found:
     """Find the records of blocks by an edition, and take what their category wants.
 
     Args:
-        number: the category.
+        category: what it takes.
         edition: of it.
         blocks: of the category.
         place: number of each among the blocks of all categories.
     """
-    form = layout(number, edition)
+    form = layout(category.number, edition)
     records, faults = find_records(blocks.data, blocks.offset, blocks.length, form)
-    columns = read_columns(blocks.data, records, form, CATEGORIES[number].fields)
+    columns = read_columns(blocks.data, records, form, category.fields)
     sequence = place[records.block] * _MOST + records.number
     return Found(form, blocks.data, records, columns, sequence, blocks.clock[records.block], faults)

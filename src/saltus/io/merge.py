@@ -1,18 +1,28 @@
 """Files to one recording: what cannot be a plot is marked, counted by reason, and the rest put in time order."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.io.clock import DAY, order_faults, standing
+from saltus.io.clock import DAY, OrderFaults, order_faults, standing
 from saltus.io.part import Part
-from saltus.records import REASONS, Contents, Kind, Plots, Recording, Source
+from saltus.records import REASONS, Contents, Kind, Plots, Recording, Source, System
 
-__all__ = ["LIMITS", "merge"]
+__all__ = [
+    "LIMITS",
+    "completed",
+    "credible_times",
+    "mark_order",
+    "mark_values",
+    "merge",
+    "next_day",
+    "shift",
+    "told_next_day",
+]
 
 # What a report can say: ranges of ground radars (m), pressure altitudes of aircraft (m), epochs from 1970 to 2100.
 LIMITS = {
@@ -31,6 +41,17 @@ LIMITS = {
     "observer_height": (-1500.0, 60000.0),
     "time": (-DAY, 4.2e9),
 }
+_WILD = [
+    REASONS.index(text)
+    for text in (
+        "clock jump",
+        "out of order",
+        "no time",
+        "impossible time of day",
+        "out of range",
+        "coasted by station",
+    )
+]
 _CODE = 1 << 24  # above all addresses
 _JUDGED = 20  # reports by which a clock is judged
 _OBSERVER = ("observer_latitude", "observer_longitude", "observer_height")
@@ -52,13 +73,10 @@ def merge(parts: Sequence[Part]) -> Recording:
     """
     parts, problems = _align_days(parts)
     plots = Plots.concat([part.plots for part in parts])
-    reason = plots.reason.copy()
-    _mark_values(plots, reason)
-    again = _repeats(plots, reason)
-    _mark(reason, again, "duplicate")
+    reason, again = mark_values(plots)
     for k, part in enumerate(parts):
         if part.in_order:
-            problems += _mark_order(plots, reason, again, k)
+            problems += mark_order(plots, reason, again, k, lambda _, time: order_faults(time))
     plots = replace(plots, reason=reason)
     tables = [part.tracks for part in parts if part.tracks is not None]
     first_file = np.cumsum([0] + [len(part.plots.files) for part in parts])
@@ -71,6 +89,15 @@ def merge(parts: Sequence[Part]) -> Recording:
         problems=tuple(p for part in parts for p in part.problems) + tuple(problems),
         files=tuple(part.file for part in parts if part.file is not None),
     )
+
+
+def mark_values(plots: Plots) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
+    """Reasons of reports with those that their values and repetition give, and which repeat an earlier one."""
+    reason = plots.reason.copy()
+    _mark_values(plots, reason)
+    again = _repeats(plots, reason)
+    _mark(reason, again, "duplicate")
+    return reason, again
 
 
 def _mark(reason: npt.NDArray[np.int8], holds: npt.NDArray[np.bool_], text: str) -> None:
@@ -123,10 +150,23 @@ def _repeats(plots: Plots, reason: npt.NDArray[np.int8]) -> npt.NDArray[np.bool_
     return again
 
 
-def _mark_order(plots: Plots, reason: npt.NDArray[np.int8], again: npt.NDArray[np.bool_], file: int) -> list[str]:
+def mark_order(
+    plots: Plots,
+    reason: npt.NDArray[np.int8],
+    again: npt.NDArray[np.bool_],
+    file: int,
+    judge: Callable[[System, npt.NDArray[np.float64]], OrderFaults],
+) -> list[str]:
     """Mark the reports of one file that come too late or whose clock jumped or stands; tell what lasts.
 
     Repeated reports, used or not (coasted, ...), say nothing about the clock: a recording doubled is as one.
+
+    Args:
+        plots: in the order received.
+        reason: of each report, 0 = none yet; is written to.
+        again: which repeat an earlier one.
+        file: whose reports are judged.
+        judge: of the times of a source.
     """
     told = []
     skipped = [REASONS.index(text) for text in ("no time", "impossible time of day", "system track")]
@@ -137,7 +177,7 @@ def _mark_order(plots: Plots, reason: npt.NDArray[np.int8], again: npt.NDArray[n
         index = np.flatnonzero(mine & np.isfinite(plots.time))
         time = plots.time[index]
         stands = standing(time, identity[index])
-        faults = order_faults(time[~stands])
+        faults = judge(source.system, time[~stands])
         jump, late = np.zeros(len(plots), np.bool_), np.zeros(len(plots), np.bool_)
         jump[index[stands]] = True
         moving = index[~stands]
@@ -186,28 +226,38 @@ def _told_wrong(
 
 
 def _align_days(parts: Sequence[Part]) -> tuple[list[Part], list[str]]:
-    """Put a file that begins after midnight on the day after the others of the same night.
-
-    Plain ASTERIX tells the time of day only, and the date given is that of the first record. So when one file
-    crosses midnight, another that begins more than 12 hours before it belongs to the next day.
-    """
-    aligned = list(parts)
-    problems = []
+    """Put a file that begins after midnight on the day after the others of the same night."""
     spans = [
         (min(t), max(t))
         for t in ([v for c in p.contents for v in (c.time_from, c.time_to) if v == v] or [np.nan] for p in parts)
     ]
-    plain = [k for k, part in enumerate(parts) if part.in_order and not part.dated]
-    crossing = [spans[k][0] for k in plain if spans[k][0] // DAY < spans[k][1] // DAY]
-    for k in plain:
-        if crossing and min(crossing) - spans[k][0] > DAY / 2:
-            aligned[k] = _shift(parts[k], DAY)
-            name = ", ".join(parts[k].plots.files)
-            problems.append(f"{name}: begins after the midnight that another file crosses: put on the next day.")
-    return aligned, problems
+    later = next_day(spans, [part.in_order and not part.dated for part in parts])
+    names = [", ".join(part.plots.files) for part in parts]
+    return [shift(part, DAY) if k in later else part for k, part in enumerate(parts)], told_next_day(names, later)
 
 
-def _shift(part: Part, seconds: float) -> Part:
+def next_day(spans: Sequence[tuple[float, float]], plain: Sequence[bool]) -> list[int]:
+    """Which of several files are of the next day.
+
+    Plain ASTERIX tells the time of day only, and the date given is that of the first record. So when one file
+    crosses midnight, another that begins more than 12 hours before it belongs to the next day.
+
+    Args:
+        spans: s, UTC, first and last time of each file, NaN = none.
+        plain: which of them tell no date.
+    """
+    some = [k for k, is_plain in enumerate(plain) if is_plain]
+    crossing = [spans[k][0] for k in some if spans[k][0] // DAY < spans[k][1] // DAY]
+    return [k for k in some if crossing and min(crossing) - spans[k][0] > DAY / 2]
+
+
+def told_next_day(names: Sequence[str], later: Sequence[int]) -> list[str]:
+    """Lines on files that were put on the next day."""
+    return [f"{names[k]}: begins after the midnight that another file crosses: put on the next day." for k in later]
+
+
+def shift(part: Part, seconds: float) -> Part:
+    """The same file or piece, so much later."""
     tracks = part.tracks
     if tracks is not None:
         column = tracks.column_names.index("time")
@@ -224,19 +274,19 @@ def _count(line: Contents, plots: Plots, file: int) -> Contents:
     own = [k for k, s in enumerate(plots.sources) if s.system == line.system]
     mine = (plots.file == file) & np.isin(plots.source, own)
     counts = Counter(plots.reason[mine & (plots.reason > 0)].tolist())
+    times = plots.time[mine & credible_times(plots)]
+    return completed(line, counts, (float(times.min()), float(times.max())) if len(times) else None)
+
+
+def completed(line: Contents, counts: Mapping[int, int], span: tuple[float, float] | None) -> Contents:
+    """A line of contents with the reports rejected, by reason, and the span of credible times."""
     line = replace(line, rejected={REASONS[code]: n for code, n in sorted(counts.items())})
-    wild = [
-        REASONS.index(text)
-        for text in (
-            "clock jump",
-            "out of order",
-            "no time",
-            "impossible time of day",
-            "out of range",
-            "coasted by station",
-        )
-    ]
-    times = plots.time[mine & ~np.isin(plots.reason, wild) & np.isfinite(plots.time)]
-    if line.n_records == line.n_reports and len(times):
-        return replace(line, time_from=float(times.min()), time_to=float(times.max()))
+    if line.n_records == line.n_reports and span is not None:
+        return replace(line, time_from=span[0], time_to=span[1])
     return line
+
+
+def credible_times(plots: Plots) -> npt.NDArray[np.bool_]:
+    """Which reports have a time that counts for the span of their source."""
+    credible: npt.NDArray[np.bool_] = ~np.isin(plots.reason, _WILD) & np.isfinite(plots.time)
+    return credible

@@ -35,14 +35,13 @@ class Part(NamedTuple):
 
 def join_parts(parts: Sequence[Part]) -> Part:
     """Make one of the pieces of one file; what the last tells of the file goes first."""
-    name = next(name for part in parts for name in part.plots.files)
     tables = [part.tracks for part in parts if part.tracks is not None]
     tally = Tally()
     for part in parts:
         tally.add(part.contents)
     last = parts[-1]
     return Part(
-        Plots.concat([part.plots for part in parts]).in_file(name),
+        Plots.concat([part.plots for part in parts], same_files=True),
         pa.concat_tables(tables) if tables else None,
         tally.lines(),
         tuple(dict.fromkeys(problem for part in (last, *parts[:-1]) for problem in part.problems)),

@@ -9,6 +9,8 @@ import numpy.typing as npt
 
 from saltus.framing import Chunk, Framer, read_chunks
 from saltus.io.blocks import Blocks, credible, joined
+from saltus.io.categories import CATEGORIES
+from saltus.io.columns import Category
 from saltus.io.editions import SAMPLE, Chosen, choose_edition
 from saltus.io.found import Found, find
 
@@ -49,20 +51,23 @@ class Stream:
         self,
         *,
         most: int | None = None,
+        blocks: tuple[int, int] | None = None,
         progress: Callable[[str, float], None] | None = None,
     ) -> Iterator[dict[int, tuple[Blocks, npt.NDArray[np.int64]]]]:
         """Yield for each category its blocks, and the number of each among the blocks of the piece.
 
         Args:
             most: bytes read at all.
+            blocks: number of the first block taken, and of the first that is not; None = all.
             progress: called with the file's name and the share read.
         """
         chunks = read_chunks(self.path, self._framer, piece=PIECE, most=most, progress=progress)
-        for blocks in map(joined, _grouped(chunks)):
+        pieces = map(joined, _grouped(chunks))
+        for some in pieces if blocks is None else _between(pieces, *blocks):
             found = {}
-            for number in np.unique(blocks.category).tolist():
-                place = np.flatnonzero(blocks.category == number)
-                found[number] = blocks.take(place), place
+            for number in np.unique(some.category).tolist():
+                place = np.flatnonzero(some.category == number)
+                found[number] = some.take(place), place
                 self.n_blocks[number] += len(place)
                 if number not in self._settled:
                     self._choose(number, found[number][0])
@@ -81,13 +86,27 @@ class Stream:
         else:
             self._settled.add(number)
 
-    def records(self, piece: Mapping[int, tuple[Blocks, npt.NDArray[np.int64]]]) -> dict[int, Found]:
+    def records(
+        self, piece: Mapping[int, tuple[Blocks, npt.NDArray[np.int64]]], categories: Mapping[int, Category] = CATEGORIES
+    ) -> dict[int, Found]:
         """The records of a piece by category, of those whose edition is known, with what the categories take."""
         return {
-            number: find(number, self.chosen[number].edition, blocks, place)
+            number: find(categories[number], self.chosen[number].edition, blocks, place)
             for number, (blocks, place) in piece.items()
             if self.chosen[number].edition
         }
+
+
+def _between(pieces: Iterable[Blocks], start: int, stop: int) -> Iterator[Blocks]:
+    """The blocks from one number up to another."""
+    before = 0
+    for blocks in pieces:
+        number = before + np.arange(len(blocks))
+        before += len(blocks)
+        if before > start:
+            yield blocks.take(np.flatnonzero((number >= start) & (number < stop)))
+        if before >= stop:
+            return
 
 
 def _grouped(chunks: Iterable[Chunk]) -> Iterator[list[Chunk]]:

@@ -47,7 +47,6 @@ def _decode(c: Columns) -> Decoded:
     )
     return Decoded(
         time_of_day=c.number("141"),
-        time_modulus=_WRAP,
         is_report=np.ones(c.n, np.bool_),
         types=kind,
         labels=c.labels("020/SSRPSR"),
@@ -72,4 +71,6 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT001 = Category(1, "monoradar plots and tracks of older radars", _FIELDS, _decode, turns=2)
+CAT001 = Category(
+    1, "monoradar plots and tracks of older radars", ("141",), _FIELDS, _decode, turns=2, time_modulus=_WRAP
+)

@@ -83,4 +83,4 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT010 = Category(10, "surface movement sensors of an airport", _FIELDS, _decode, traits=Traits(surface=True))
+CAT010 = Category(10, "surface movement sensors of an airport", ("140",), _FIELDS, _decode, traits=Traits(surface=True))

@@ -47,4 +47,4 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT011 = Category(11, "tracks of an airport surface centre", _FIELDS, _decode, traits=Traits(surface=True))
+CAT011 = Category(11, "tracks of an airport surface centre", ("140",), _FIELDS, _decode, traits=Traits(surface=True))

@@ -92,4 +92,4 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT020 = Category(20, "multilateration", _FIELDS, _decode, turns=19)
+CAT020 = Category(20, "multilateration", ("140",), _FIELDS, _decode, turns=19)

@@ -23,7 +23,7 @@ Containment radii are bounds of integrity and no measure of accuracy. Velocities
 import numpy as np
 
 from saltus.asterix.codec import Want
-from saltus.io.columns import Category, Columns, Decoded, Numbers, first_reason
+from saltus.io.columns import Category, Columns, Decoded, Numbers, first_reason, time_of_day
 from saltus.records import Datum, Kind, Traits
 
 __all__ = ["CAT021"]
@@ -33,6 +33,7 @@ _FIELDS: tuple[str | Want, ...] = (
     *"070/MODE3A 170 161/TRNUM 210/VN 090/NACP 090/NUCPNIC 090/PIC".split(),
     Want("090/PA", "raw"),
 )
+_TIME = ("077", "073", "071", "030")  # the best last
 _EARTH = 6371000.0  # m: an angle's step as a length
 _NM = 1852.0
 _HEIGHT_FULL = 32767 * 6.25 * 0.3048  # m, I021/140
@@ -59,7 +60,7 @@ def _decode(c: Columns) -> Decoded:
         },
     )
     return Decoded(
-        time_of_day=_time(c),
+        time_of_day=time_of_day(c, _TIME),
         is_report=np.ones(c.n, np.bool_),
         types=c.code("040/ATP"),
         labels=c.labels("040/ATP"),
@@ -82,14 +83,6 @@ def _decode(c: Columns) -> Decoded:
         new_cycle=np.zeros(c.n, np.bool_),
         steps={"xy_lsb": step * _EARTH, "altitude_lsb": 25 * 0.3048, "time_lsb": 1 / 128},
     )
-
-
-def _time(c: Columns) -> Numbers:
-    time = np.full(c.n, np.nan)
-    for item in ("077", "073", "071", "030"):  # the best last
-        given = c.number(item)
-        time = np.where(np.isnan(given), time, given)
-    return time
 
 
 def _position(c: Columns) -> tuple[Numbers, Numbers, float]:
@@ -127,6 +120,7 @@ def _of(table: Numbers, codes: np.ndarray) -> Numbers:
 CAT021 = Category(
     21,
     "ADS-B reports of a ground station",
+    _TIME,
     _FIELDS,
     _decode,
     traits=Traits(self_reporting=True, rest_period=5.0, sigma_time=0.2 / 12.0**0.5),

@@ -82,4 +82,4 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT048 = Category(48, "monoradar plots", _FIELDS, _decode, turns=34)
+CAT048 = Category(48, "monoradar plots", ("140",), _FIELDS, _decode, turns=34)

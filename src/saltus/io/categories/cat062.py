@@ -45,4 +45,4 @@ def _decode(c: Columns) -> Decoded:
     )
 
 
-CAT062 = Category(62, "system tracks of a surveillance centre", _FIELDS, _decode)
+CAT062 = Category(62, "system tracks of a surveillance centre", ("070",), _FIELDS, _decode)

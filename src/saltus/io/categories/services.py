@@ -23,11 +23,18 @@ def _service(
     number: int, words: str, time: str, message: str, cycle: int = -1, site: tuple[str, str, str] | None = None
 ) -> Category:
     decode = partial(status, time=time, message=message, cycle=cycle, site=site)
-    return Category(number, words, (time, message, *(site or ())), decode)
+    return Category(number, words, (time,) if time else (), (time, message, *(site or ())), decode)
 
 
 def _counted(number: int, words: str, time: str, message: str = "") -> Category:
-    return Category(number, words, (time, message), partial(status, time=time, message=message), counted=True)
+    return Category(
+        number,
+        words,
+        (time,) if time else (),
+        (time, message),
+        partial(status, time=time, message=message),
+        counted=True,
+    )
 
 
 SERVICES = (
