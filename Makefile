@@ -58,17 +58,19 @@ bench-asterix: $(READY)
 	build/bench-asterix/bin/python -m pip install -q asterix_decoder==0.7.11
 	$(BIN)/python benchmarks/asterix_speed.py --peer build/bench-asterix/bin/python
 
-# The compiled kernel under the address and undefined-behaviour sanitizers, in an environment that borrows the tools
-# of .venv. Python itself leaks at exit, so leaks are not looked for.
+# All compiled code under the address and undefined-behaviour sanitizers: the kernel for 1 to 9 states at the baseline and
+# at the widest instruction set of the machine, the ASTERIX codec, framing. The environment borrows the tools of .venv.
+# SANITIZED: the tests to run; CI runs the fewest that meet all code. Python leaks at exit: leaks are not looked for.
+SANITIZED ?= tests/native tests/asterix tests/framing tests/filters/test_imm.py tests/filters/test_bank.py \
+  tests/filters/test_coloured.py tests/filters/test_hostile.py
 sanitize: $(READY)
 	$(PYTHON) -m venv build/sanitize
-	SALTUS_REQUIRE_NATIVE=1 build/sanitize/bin/python -m pip install -q --no-deps --force-reinstall . \
+	SALTUS_REQUIRE_NATIVE=1 SALTUS_ISAS=native build/sanitize/bin/python -m pip install -q --no-deps --force-reinstall . \
 	  -C cmake.define.SALTUS_SANITIZE=ON -C build-dir=build/sanitize/cmake
 	LD_PRELOAD="$$($${CXX:-g++} -print-file-name=libasan.so) $$($${CXX:-g++} -print-file-name=libstdc++.so)" \
-	  ASAN_OPTIONS=detect_leaks=0 SALTUS_REQUIRE_NATIVE=1 \
+	  ASAN_OPTIONS=detect_leaks=0 UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 SALTUS_REQUIRE_NATIVE=1 \
 	  PYTHONPATH="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" \
-	  build/sanitize/bin/python -m pytest tests/native tests/asterix tests/filters/test_imm.py tests/filters/test_bank.py \
-	  tests/filters/test_coloured.py
+	  build/sanitize/bin/python -m pytest -n auto $(SANITIZED)
 
 # Every reader under mutated inputs, guided by the branches they reach, for so many seconds each; the fuzzer lives in an
 # environment of its own that borrows the packages of .venv. What fails goes to tests/fuzz/corpus.

@@ -8,11 +8,24 @@ SaltusError
 Every message says what is wrong, where (with the values), and how to mend it.
 """
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
 __all__ = ["DataError", "ModelError", "NumericalError", "SaltusError"]
 
 
 class SaltusError(Exception):
-    """Base of every exception raised on purpose."""
+    """Base of every exception raised on purpose.
+
+    Attributes:
+        runs: where a batch filter refuses some of its runs: which, (runs,), True for those known to be refused, in the
+            order of `z.reshape(-1, T, m)`; a later row of another may yet be. None where it is no matter of one run.
+    """
+
+    runs: "npt.NDArray[np.bool_] | None" = None
 
 
 class ModelError(SaltusError):

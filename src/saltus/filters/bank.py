@@ -163,8 +163,8 @@ class Bank:
             ModelError: arrays that do not fit.
             DataError: inf in z, or a z so far from its prediction that the distance overflows.
             NumericalError: a measured component has neither noise nor uncertainty, or a prediction has overflowed.
-                After a DataError or NumericalError that names a row i, only row rows[i] is undefined in the native
-                store; the NumPy store leaves all rows as they were.
+                Either names a run i, which is row rows[i]; `error.runs` says it as well. After it rows that could not
+                be conditioned are undefined in the native store; the NumPy store leaves all as they were.
         """
         rows = self._distinct(rows)
         return self._store.measure(rows, _measured(z, len(rows)), H, d, R, mode, write=True)

@@ -211,7 +211,9 @@ def run_differenced(
         steps = moves._replace(Phi=data.aligned.F, B=data.aligned.Q, b=data.aligned.b)
         return filter_differenced(data, steps, n, per_mode=per_mode, every=keep == "all")
     except NotPositive as error:
-        raise known_exactly(error.where, moves.B, whole.shape[-1], len(trans)) from error
+        told = known_exactly(error.where, moves.B, whole.shape[-1], len(trans))
+        told.runs = error.runs
+        raise told from error
 
 
 def _differenced_native(

@@ -14,7 +14,7 @@ from saltus.filters.align import Aligned, covariances, finite
 from saltus.filters.backend import instruction_set, thread_count
 from saltus.filters.estimates import Estimates, allocate
 from saltus.filters.particles import Merged, Tables
-from saltus.filters.refusals import NotPositive, not_finite, place, too_far
+from saltus.filters.refusals import NotPositive, not_finite, of_runs, place, too_far
 from saltus.filters.steps import Belief
 
 __all__ = ["NativeStore", "Run", "filter_native"]
@@ -54,18 +54,28 @@ def filter_native(z: _Array, aligned: Callable[[bool], Aligned], run: Run) -> Es
     if len(bad):
         first, batch = int(bad[0]), z.shape[:-2]
         where = tuple(int(i) for i in np.unravel_index(first, batch)) if batch else ()
-        raise _refusal(faults[first], z[where], len(faults) - len(bad), where)
+        refused = (faults[:, 0] != 0).reshape(batch)
+        raise of_runs(_refusal(faults[first], z[where], len(faults) - len(bad), where), refused)
     return out
 
 
 def _refusal(fault: _Modes, z: _Array, others: int, run: tuple[int, ...] = ()) -> SaltusError:
     """What a fault of the kernel means: its kind, row and component, with the (T, m) it happened in."""
     kind, row, component = (int(i) for i in fault)
+    return _of_kind(kind, place(run, row, component), place(run, row), float(z[row, component]), others)
+
+
+def _refused_row(fault: _Modes, z: _Array) -> SaltusError:
+    """The same for the rows of a bank, (k, m), each of them a run of its own."""
+    kind, row, component = (int(i) for i in fault)
+    told = _of_kind(kind, place([row], None, component), place([row]), float(z[row, component]), 0)
+    return of_runs(told, np.arange(len(z)) == row)
+
+
+def _of_kind(kind: int, where: str, at: str, value: float, others: int) -> SaltusError:
     if kind == _NOT_POSITIVE:
-        return NotPositive(place(run, row, component))
-    if kind == _NOT_FINITE:
-        return not_finite(place(run, row))
-    return too_far(place(run, row, component), float(z[row, component]), others)
+        return NotPositive(where)
+    return not_finite(at) if kind == _NOT_FINITE else too_far(where, value, others)
 
 
 def _run(z: _Array, model: Aligned, run: Run) -> tuple[Estimates, _Modes, int]:
@@ -202,7 +212,7 @@ class NativeStore:
         if fault[0] == _DOUBTFUL:
             raise ModelError("R is not positive semidefinite. Give covariances, never factors or precisions.")
         if fault[0]:
-            raise _refusal(fault, z, len(rows) - 1)
+            raise _refused_row(fault, z)
         return d2, log_f
 
     def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]:
@@ -219,7 +229,7 @@ class NativeStore:
         same = tables.same(len(trans))
         fault = self._lanes.expand(rows, now, same, trans, z, F, b, Q, H, d, R, law, log_f)
         if fault[0]:
-            raise _refusal(np.array(fault), z, len(rows) - 1)
+            raise _refused_row(np.array(fault), z)
         return law, log_f
 
     def merged(self, rows: _Rows, weights: _Array, labels: _Modes, n_labels: int) -> Merged:

@@ -212,7 +212,7 @@ def _start(
     cov0 = np.broadcast_to(flat.cov0[0], (M, n, n))[mode.ravel()]
     bank = Bank(n, (), capacity=lots * size, backend=backend)
     bank.add(steps.Belief(np.zeros(lots * size), mean0, cov0))
-    return bank, mode.ravel(), log_w - logsumexp(log_w, (1,))
+    return bank, mode.ravel(), normalised(log_w, (1,))[0]
 
 
 def _tables(flat: Flat, k: int) -> Tables:
@@ -238,7 +238,7 @@ def _branched(
     chosen, log_w = thinned(pairs, size, rng)
     mode, parents = np.divmod(chosen, size)
     bank = bank.take((parents + size * np.arange(lots)[:, None]).ravel())
-    return bank, mode.ravel(), log_w - logsumexp(log_w, (1,)), np.isfinite(pairs).sum(1) > size
+    return bank, mode.ravel(), normalised(log_w, (1,))[0], np.isfinite(pairs).sum(1) > size
 
 
 def _moments(
@@ -254,10 +254,9 @@ def _moments(
     groups = steps.collapse(log_mass, means, covs, 1)
     mean, cov = steps.collapse(np.full((B, G), -np.log(G)), *groups, 1)
     # Modes without any particle have zeros for moments, and weigh nothing.
-    by_group, total = np.moveaxis(log_mass, 1, -1), logsumexp(log_mass, (1,))[:, 0]
-    given = by_group - np.where(np.isfinite(total), total, 0.0)[..., None]
+    given, total = normalised(np.moveaxis(log_mass, 1, -1), (2,))
     merged = steps.collapse(given, np.moveaxis(means, 1, -2), np.moveaxis(covs, 1, -3), 1)
-    return steps.Belief(total - np.log(G), *merged), groups[0], mean, cov
+    return steps.Belief(total[..., 0] - np.log(G), *merged), groups[0], mean, cov
 
 
 def _predicted(now: steps.Belief, flat: Flat, k: int) -> tuple[steps.Joint, _Array]:

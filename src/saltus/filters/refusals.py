@@ -1,13 +1,17 @@
 """Why a filter refuses a measurement: what both backends say, with run, row and component."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
-from saltus.errors import DataError, NumericalError
+from saltus.errors import DataError, NumericalError, SaltusError
 from saltus.shapes import Bool, Float
 
-__all__ = ["NotPositive", "check_evidence", "check_finite", "not_finite", "place", "too_far"]
+__all__ = ["NotPositive", "check_evidence", "check_finite", "not_finite", "of_runs", "place", "too_far"]
+
+_Error = TypeVar("_Error", bound=SaltusError)
 
 
 class NotPositive(NumericalError):
@@ -32,6 +36,13 @@ def place(run: Sequence[int] = (), row: int | None = None, component: int | None
     return ", ".join(part for part in parts if part) or "the measurement"
 
 
+def of_runs(error: _Error, refused: npt.ArrayLike) -> _Error:
+    """Let an error say which runs it is about: `refused` has the axes of the batch, none for a single run."""
+    if np.ndim(refused):
+        error.runs = np.asarray(refused, bool).ravel()
+    return error
+
+
 def too_far(where: str, value: float, others: int, predicted: str = "") -> DataError:
     """A measurement so far from what every mode predicts that double precision cannot hold its distance.
 
@@ -42,7 +53,7 @@ def too_far(where: str, value: float, others: int, predicted: str = "") -> DataE
         predicted: what was predicted instead, if known.
     """
     told = f", where {predicted} was predicted" if predicted else ""
-    rest = f" The other {others} run(s) have no such row: without this one they are filtered." if others else ""
+    rest = f" The other {others} run(s) have no such row: z[~error.runs] holds them alone." if others else ""
     return DataError(
         f"{where} measures {value:.6g}{told}: its distance overflows double precision. Give NaN for an outlier; check "
         f"units.{rest}"
@@ -79,7 +90,8 @@ def check_evidence(
         DataError: a measurement is too far from what every mode predicts.
         NumericalError: a prediction has overflowed.
     """
-    bad = np.argwhere(~np.isfinite(log_f))
+    refused = ~np.isfinite(log_f)
+    bad = np.argwhere(refused)
     if not len(bad):
         return
     run = tuple(int(i) for i in bad[0])
@@ -91,11 +103,12 @@ def check_evidence(
         sigma = np.sqrt(np.sum(np.square(Y), axis=-1))
         away = np.where(seen[run], np.abs(z[run] - y) / sigma, 0.0)
     if not (np.isfinite(y).all() and np.isfinite(sigma).all()):
-        raise not_finite(place(run, row))
+        raise of_runs(not_finite(place(run, row)), refused)
     mode = int(away.max(axis=-1).argmin())
     a = int(away[mode].argmax())
     predicted = f"{y[mode, a]:.6g} +- {sigma[mode, a]:.3g}"
-    raise too_far(place(run, row, a), float(z[run][a]), int(np.isfinite(log_f).sum()), predicted)
+    told = too_far(place(run, row, a), float(z[run][a]), int(np.isfinite(log_f).sum()), predicted)
+    raise of_runs(told, refused)
 
 
 def check_finite(
@@ -108,4 +121,5 @@ def check_finite(
     """
     sound = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-1, -2))
     if not sound.all():
-        raise not_finite(place([int(i) for i in np.argwhere(~np.asarray(sound))[0]], row))
+        refused = ~np.asarray(sound)
+        raise of_runs(not_finite(place([int(i) for i in np.argwhere(refused)[0]], row)), refused)

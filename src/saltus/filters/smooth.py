@@ -278,8 +278,8 @@ def _unmix(
     log_z = ((0.5 * (a_j + e)) * delta).sum(-1) - 0.5 * log_det + 0.5 * (e * (D @ a_ij[..., None])[..., 0]).sum(-1)
     with np.errstate(divide="ignore"):
         w = np.where(sign > 0, np.log(t) + c[..., None, :] + log_z, -np.inf)
-    c_i = logsumexp(w, (w.ndim - 1,))
-    u = np.exp(w - np.where(np.isfinite(c_i), c_i, 0.0))
+    log_u, c_i = normalised(w, (w.ndim - 1,))
+    u = np.exp(log_u)
     a_i = (u[..., None] * a_ij).sum(-2)
     A = (u[..., None, None] * B_ij).sum(-3)
     apart = a_ij - a_i[..., None, :]

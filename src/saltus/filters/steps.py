@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from saltus.filters.refusals import NotPositive, check_evidence, place
+from saltus.filters.refusals import NotPositive, check_evidence, of_runs, place
 from saltus.linalg import NOTHING, cholesky, normalised, symmetric
 from saltus.shapes import Bool, Float
 
@@ -228,7 +228,8 @@ def condition(
     swept = _sweep(np.concatenate([rows, X], axis=-2), np.concatenate([nu, np.zeros(X.shape[:-1])], axis=-1), seen)
     if swept.empty.any():
         first = [int(i) for i in np.argwhere(swept.empty)[0]]
-        raise NotPositive(place(first[:n_runs], row, first[-1]))
+        refused = swept.empty.any(axis=tuple(range(n_runs, swept.empty.ndim)))
+        raise of_runs(NotPositive(place(first[:n_runs], row, first[-1])), refused)
     loglik = np.asarray(-0.5 * (swept.d2 + swept.logdet + _LOG_2PI * seen.sum(-1)))
     return Conditioned(mean - swept.left, _squares(swept.rows), loglik, swept.d2)
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.linalg import logsumexp
+from saltus.linalg import logsumexp, normalised
 from saltus.records import Kind
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import TrackerSettings
@@ -292,9 +292,8 @@ class SourceCondition:
         told = np.asarray(voice, float)[:, None] * bounded
         total = prior + told.sum(axis=0)
         if np.any(voice) and q > 1:
-            self._log_probs = total - logsumexp(total, (0,))
+            self._log_probs = normalised(total, (0,))[0]
             self._time = max(self._time, time)  # a later round of a slice may hold earlier plots
             self._history.append((self._time, np.exp(self._log_probs)))
-        others = total - told
-        others = others - logsumexp(others, (1,))
+        others = normalised(total - told, (1,))[0]
         return np.asarray(logsumexp(others[:, :, None] + law.log_own, (1,))[:, 0])

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.linalg import logsumexp
+from saltus.linalg import normalised
 from saltus.tracks.faults import SourceCondition, weighty
 from saltus.tracks.gates import Gated
 from saltus.tracks.kinematics import Chosen, Kinematics
@@ -40,8 +40,7 @@ def judge(source: SourceCondition, time: float, prior: _Array, log_f: _Array, vo
         voice: what each may say of the source, (k,).
     """
     weights = source.absorb(time, prior, log_f, voice)
-    log_p = weights + log_f
-    p = np.asarray(np.exp(log_p - logsumexp(log_p, (1,))))
+    p = np.asarray(np.exp(normalised(weights + log_f, (1,))[0]))
     return Judged(weights, p, *source.law.faulty(p))
 
 
