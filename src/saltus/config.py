@@ -58,6 +58,7 @@ _HINTS = {
     "sac": "a whole number from 0 to 255",
     "sic": "a whole number from 0 to 255",
     "category": "an ASTERIX category, 1 to 255",
+    "channel": 'text, as channel = "board 1 line 2"; saltus info shows the channels',
     "latitude": "degrees north, -90 to 90",
     "longitude": "degrees east, -180 to 180",
     "height": "m above mean sea level, -450 to 9000 (1 ft = 0.3048 m); leave it out when unknown",
@@ -96,6 +97,7 @@ class SensorConfig(BaseModel):
     sic: _Octet | None = None
     height: Annotated[float, Field(ge=-450.0, le=9000.0)] | None = None
     category: Annotated[int, Field(ge=1, le=255)] | None = None
+    channel: _Name = ""
     name: _Name = ""
     sigma_range: _Sigma | None = None
     sigma_azimuth: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
@@ -113,14 +115,18 @@ class SensorConfig(BaseModel):
             raise ValueError("sac and sic go together: give both")
         if self.sac is None and not self.name:
             raise ValueError("give sac and sic, or for tables the name of the source")
+        if self.channel and self.sac is None:
+            raise ValueError("a channel tells sensors of one SAC and SIC apart: give sac and sic with it")
         if (self.latitude is None) != (self.longitude is None):
             raise ValueError("latitude and longitude go together: give both, or neither to configure noise alone")
         return self
 
     def matches(self, system: System) -> bool:
-        """Whether this is the sensor of a system: by SAC and SIC (and category, if given), tables by name."""
+        """Whether this is the sensor of a system: by SAC and SIC (category, channel, if given), tables by name."""
         if system.category is None:
             return self.name == system.name
+        if self.channel not in ("", system.channel):
+            return False
         return (self.sac, self.sic) == (system.sac, system.sic) and self.category in (None, system.category)
 
 
@@ -149,9 +155,14 @@ class Config(BaseModel):
     learnt: Learnt | None = None
 
     def site_for(self, system: System) -> SensorConfig | None:
-        """The sensor of a system; one that names the category goes before one that does not."""
+        """The sensor of a system; one that names channel or category goes before one that does not."""
         found = [s for s in self.sensor if s.matches(system)]
-        return min(found, key=lambda s: s.category is None, default=None)
+        return min(found, key=lambda s: (not s.channel, s.category is None), default=None)
+
+    @property
+    def apart(self) -> frozenset[tuple[int, int]]:
+        """SAC and SIC of the sensors that are told apart by channel."""
+        return frozenset((s.sac, s.sic) for s in self.sensor if s.channel and s.sac is not None and s.sic is not None)
 
 
 def load_config(path: Path | str | None, *, date: str | None = None, framing: str | None = None) -> Config:
@@ -252,11 +263,12 @@ def _told_apart(path: Path | str, sensors: Sequence[SensorConfig]) -> None:
     seen: dict[str, int] = {}
     for k, s in enumerate(sensors):
         category = "" if s.category is None else f", category = {s.category}"
+        category += f', channel = "{s.channel}"' if s.channel else ""
         for key in ([] if s.sac is None else [f"sac = {s.sac}, sic = {s.sic}{category}"]) + [f'name = "{s.name}"']:
             if key in seen:
                 named = key.startswith("name")
                 what = "have one name" if named else "are the same system"
-                cure = "give each its own name" if named else "tell them apart by category"
+                cure = "give each its own name" if named else "tell them apart by category or channel"
                 raise ModelError(
                     f"{path}: [[sensor]] number {seen[key] + 1} and number {k + 1} {what} ({key}); keep one, or {cure}."
                 )

@@ -62,6 +62,7 @@ class System:
     sac: int | None
     sic: int | None
     name: str = ""
+    channel: str = ""  # the line or connection that brings it, where another sensor sends the same SAC and SIC
 
     def __str__(self) -> str:
         """Like `CAT048:20/129`, or the name for tables."""
@@ -69,7 +70,7 @@ class System:
             return self.name
         if self.sac is None:
             return f"CAT{self.category:03d}"
-        return f"CAT{self.category:03d}:{self.sac}/{self.sic}"
+        return f"CAT{self.category:03d}:{self.sac}/{self.sic}" + (f" on {self.channel}" if self.channel else "")
 
 
 @dataclass(frozen=True, slots=True)

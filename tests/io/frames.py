@@ -21,10 +21,12 @@ PLOT = bytes.fromhex(
 NORTH = bytes.fromhex("22 000c e8 1481 01 003200 0200")
 
 
-def plot(*, tod=100.5, rho=2560, theta=0x4000, kind="a0", code="029c", level="0190", state="2000", sic=0x81):
+def plot(
+    *, tod=100.5, rho=2560, theta=0x4000, kind="a0", code="029c", level="0190", state="2000", sic=0x81, address=0x3C6444
+):
     """PLOT with fields replaced, each as it stands in the frame."""
     return bytes.fromhex(
-        f"30001f fdc102 14{sic:02x} {round(tod * 128):06x} {kind} {rho:04x}{theta:04x} {code} {level} 3c6444"
+        f"30001f fdc102 14{sic:02x} {round(tod * 128):06x} {kind} {rho:04x}{theta:04x} {code} {level} {address:06x}"
         f"10c231820820 {state}"
     )
 

@@ -18,7 +18,13 @@ DATE = datetime.date(2024, 5, 1)
 def radar(first, n, *, sic=0x81, step=0.1, turn=40):
     """Plots of a radar whose targets stand at one azimuth each and move outward."""
     return [
-        frames.plot(tod=(first + step * k) % 86400, rho=2560 + 4 * (k // turn), theta=1600 * (k % turn), sic=sic)
+        frames.plot(
+            tod=(first + step * k) % 86400,
+            rho=2560 + 4 * (k // turn),
+            theta=1600 * (k % turn),
+            sic=sic,
+            address=0x400000 + k % turn,
+        )
         for k in range(n)
     ]
 

@@ -77,9 +77,13 @@ class Framer:
 
     def stop(self) -> None:
         """Close the account where the blocks yielded so far end; more bytes would follow."""
+        self.told.end(self._base + self._place, self._packets.passed, self.channels)
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels so far, in the order of their numbers."""
         lines = [f"board {line >> 8} line {line & 255}" for line in self._lines]
-        channels = [_ends(key) for key in self._packets.channels] or lines
-        self.told.end(self._base + self._place, self._packets.passed, channels)
+        return [_ends(key) for key in self._packets.channels] or lines
 
     def _go_on(self, piece: _Bytes, *, final: bool) -> Iterator[Chunk]:
         rest = self._buffer[self._keep :]

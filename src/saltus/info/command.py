@@ -60,14 +60,16 @@ def show_info(
         ModelError: the configuration or the date is wrong.
     """
     config = load_config(config_path, date=date, framing=framing)
-    told = Told(config.date, config.editions, config.framing, config.reading, None if full else _HEAD)
+    told = Told(config.date, config.editions, config.framing, config.reading, None if full else _HEAD, config.apart)
     inventory, parts = Inventory(), list[Part]()
     failures: dict[str, SaltusError | OSError] = {}
     paths = expand(inputs)
     for path in paths:
         try:
             if full and path.stat().st_size > _HEAD and "table" not in format_of(path, config.framing).name:
-                for part in read_pieces(path, date=told.date, editions=told.editions, framing=told.framing):
+                for part in read_pieces(
+                    path, date=told.date, editions=told.editions, framing=told.framing, apart=told.apart
+                ):
                     inventory.add(merge([printable(part)]))
             else:
                 parts.append(read_part(path, told))

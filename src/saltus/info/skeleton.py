@@ -44,6 +44,8 @@ def _sensor(system: System, some: Sequence[Line], every: Sequence[Line]) -> list
     lines = ["[[sensor]]" + (f"                       # {words}" if words else "")]
     if system.category is not None:
         lines += [f"sac = {system.sac}", f"sic = {system.sic}", f"category = {system.category}"]
+    if system.channel:
+        lines.append(f'channel = "{system.channel}"')
     name = str(system).replace("\\", "\\\\").replace('"', '\\"')
     lines.append(f'name = "{name}"')
     lines += _site(system, some, every)

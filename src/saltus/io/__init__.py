@@ -1,7 +1,7 @@
 """Recordings in: ASTERIX files, packet captures and tables become target reports as arrays."""
 
 import datetime
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +39,7 @@ def _asterix(path: Path, told: Told, progress: Progress | None) -> Part:
         framing=told.framing,
         most=told.most,
         memory=told.settings.memory,
+        apart=told.apart,
         progress=progress,
     )
 
@@ -67,6 +68,7 @@ def read(
     framing: str | None = None,
     progress: Progress | None = None,
     settings: ReadingSettings | None = None,
+    apart: Iterable[tuple[int, int]] = (),
 ) -> Recording:
     """Read files and merge them by time.
 
@@ -81,13 +83,15 @@ def read(
         framing: of ASTERIX files, one of `saltus.framing.NAMES`; None has it guessed.
         progress: called with a file's name and the fraction read.
         settings: bounds of reading.
+        apart: SAC and SIC of sources that are told apart by the channel that brings them; where two sensors plainly
+            send one code on channels of their own they are without being named.
 
     Raises:
         DataError: a file is empty, of unknown format, without one readable record, or larger than the settings allow.
     """
     if not paths:
         raise DataError("no input given: name at least one recording.")
-    told = Told(date, editions or {}, framing, settings or ReadingSettings())
+    told = Told(date, editions or {}, framing, settings or ReadingSettings(), None, frozenset(apart))
     return merge([read_part(path, told, progress) for path in expand(paths)])
 
 
@@ -99,6 +103,7 @@ def read_in_order(
     framing: str | None = None,
     progress: Progress | None = None,
     settings: ReadingSettings | None = None,
+    apart: Iterable[tuple[int, int]] = (),
 ) -> Iterator[Recording]:
     """Read files and merge them by time as `read` does, a chunk at a time: memory does not grow with ASTERIX files.
 
@@ -114,6 +119,7 @@ def read_in_order(
         framing: of ASTERIX files.
         progress: called with a file's name and the fraction read.
         settings: bounds of reading; reports that wait for others take no more than `memory`.
+        apart: SAC and SIC of sources that are told apart by channel.
 
     Yields:
         Recordings whose usable reports are in order of time from first to last; rejected ones come with the piece of
@@ -126,7 +132,7 @@ def read_in_order(
 
     if not paths:
         raise DataError("no input given: name at least one recording.")
-    told = Told(date, editions or {}, framing, settings or ReadingSettings())
+    told = Told(date, editions or {}, framing, settings or ReadingSettings(), None, frozenset(apart))
     indexed = [
         table_run(read_part(path, told, progress), k)
         if "table" in format_of(path, framing).name

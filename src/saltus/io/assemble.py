@@ -1,7 +1,7 @@
 """Records of a recording, as columns, to target reports and lines of contents."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from saltus.io.columns import Decoded
 from saltus.io.dating import Clock, Read, read_records
 from saltus.io.found import Found
 from saltus.io.part import Part, revisit, rotating
+from saltus.io.same_code import SameCode
 from saltus.records import Contents, Kind, Plots, Source, System, Traits
 
 __all__ = ["Assembler"]
@@ -23,30 +24,52 @@ __all__ = ["Assembler"]
 class Assembler:
     """Turns the records of a recording, piece after piece, into target reports and lines of contents."""
 
-    def __init__(self, name: str, clock: Clock, before: Mapping[int, int] | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        clock: Clock,
+        before: Mapping[int, int] | None = None,
+        apart: Collection[tuple[int, int]] = (),
+    ) -> None:
         """Begin a recording.
 
         Args:
             name: of the file.
             clock: that dates its records.
             before: records of each category before those that will be given.
+            apart: SAC and SIC of the sources that are told apart by the channel that brings them.
         """
+        self.same_code = SameCode()
+        self._apart = apart
         self._name, self._clock = name, clock
         self._before = Counter(before or {})  # records of each category in the pieces before
         self.read: dict[int, Read] = {}  # of the last piece, and
         self.times: dict[int, npt.NDArray[np.float64]] = {}  # the times of its records
         self._doubted = False  # the clock of the capture was found to be another
 
-    def part(self, found: Mapping[int, Found], notes: Mapping[int, tuple[str, ...]], *, dated: bool) -> Part:
+    def part(
+        self,
+        found: Mapping[int, Found],
+        notes: Mapping[int, tuple[str, ...]],
+        channels: Sequence[str] = (),
+        *,
+        dated: bool,
+    ) -> Part:
         """Take the next piece.
 
         Args:
             found: records by category.
             notes: on each category.
+            channels: names of the channels so far.
             dated: the clocks of all blocks tell the date.
         """
         name, clock = self._name, self._clock
-        read = {number: read_records(CATEGORIES[number], records) for number, records in found.items() if len(records)}
+        names = dict(enumerate(channels))
+        read = {
+            number: read_records(CATEGORIES[number], records, names, self._apart)
+            for number, records in found.items()
+            if len(records)
+        }
         times = clock.times(read, dated=dated)
         self.read, self.times = read, times
         problems: list[str] = []
@@ -57,8 +80,10 @@ class Assembler:
             self._doubted = bool(told)
         plots, tracks, contents = [], [], []
         turns = _turns(read, times)
+        self._look_for_two(read, times)
         for number, r in read.items():
             part = _plots(name, CATEGORIES[number].traits, r, times[number], self._before[number])
+            self.same_code.add(part, r.found.channel[r.decoded.is_report].astype(np.int64))
             self._before[number] += len(r.found)
             plots.append(part)
             if r.decoded.tracks is not None:
@@ -73,6 +98,16 @@ class Assembler:
             in_order=True,
             dated=clock.captured,
         )
+
+    def _look_for_two(self, read: Mapping[int, Read], times: Mapping[int, npt.NDArray[np.float64]]) -> None:
+        """Look for north marks of two antennas of one code."""
+        for number, r in read.items():
+            marks = np.flatnonzero(r.decoded.new_cycle)
+            codes = np.array([(s.sac or 0) << 8 | (s.sic or 0) for s in r.systems], np.int64)[r.system_of[marks]]
+            for code in np.unique(codes).tolist():
+                own = marks[codes == code]
+                channel = r.found.channel[own].astype(np.int64)
+                self.same_code.turns((code >> 8, code & 255), times[number][own], channel)
 
 
 def _lines(
@@ -146,7 +181,7 @@ def _contents(
     decoded = r.decoded
     kinds, counts = np.unique(decoded.types[mine], return_counts=True)
     own = plots.take(np.flatnonzero(plots.source == plots.sources.index(_source_of(plots, system))))
-    service = System(CATEGORIES[number].turns or number, system.sac, system.sic)
+    service = replace(system, category=CATEGORIES[number].turns or number)
     period = turns.get(service, turns.get(system, np.nan))
     if np.isnan(period):
         numbered = decoded.tracks is not None  # another system's tracks are told apart by their numbers

@@ -9,7 +9,7 @@ cannot be told apart, so it counts as no record, and a problem names its byte.
 """
 
 import datetime
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,9 +29,10 @@ from saltus.io.stream import Stream
 from saltus.io.stretches import Stretches, order_words
 from saltus.records import Contents, FileContents, Plots, System
 
-__all__ = ["about_file", "index_blocks", "pieces_of", "read_asterix", "read_pieces", "told_dateless"]
+__all__ = ["about_file", "channels_apart", "index_blocks", "pieces_of", "read_asterix", "read_pieces", "told_dateless"]
 
 PER_REPORT = 250.0  # bytes that a report takes until it is merged, measured; see docs/formats.md
+_BEGINNING = 1 << 22  # bytes that tell whether channels are sensors
 _TOLD = 8  # problems of one kind told one by one
 
 
@@ -43,6 +44,7 @@ def read_asterix(
     framing: str | None = None,
     most: int | None = None,
     memory: float = np.inf,
+    apart: Iterable[tuple[int, int]] = (),
     progress: Callable[[str, float], None] | None = None,
 ) -> Part:
     """Read one recording: its reports are held, its bytes and items a piece at a time.
@@ -54,21 +56,23 @@ def read_asterix(
         framing: one of `saltus.framing.NAMES`; None has it guessed.
         most: bytes read, from the beginning; None = all.
         memory: bytes that its reports may take until they are merged.
+        apart: SAC and SIC of sources that are told apart by channel.
         progress: called with the file's name and the fraction read.
 
     Raises:
         DataError: the file is empty, holds no record, or too many reports, or an edition does not exist or is plainly
             not the file's.
     """
-    stream = Stream(path, editions, framing)
+    stream = Stream(path, editions, framing, apart=apart)
     parts: list[Part] = []
     n = 0
     for part in pieces_of(stream, date, most=most, progress=progress):
         n += len(part.plots)
         refuse_size(path, n * PER_REPORT, memory, f"more than {n} reports")
         parts.append(part)
-    if stream.changed:  # now that all is known of its editions
-        parts = list(pieces_of(Stream(path, editions, framing, stream.chosen), date, most=most, progress=progress))
+    if stream.changed or stream.found_apart:  # now that all is known of its editions and sources
+        again = Stream(path, editions, framing, stream.chosen, stream.apart | stream.found_apart)
+        parts = list(pieces_of(again, date, most=most, progress=progress))
     return join_parts(parts)
 
 
@@ -79,6 +83,7 @@ def read_pieces(
     editions: Mapping[int, str],
     framing: str | None = None,
     most: int | None = None,
+    apart: Iterable[tuple[int, int]] = (),
     progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[Part]:
     """Read one recording as `read_asterix` does, a piece at a time: memory does not grow with it.
@@ -89,12 +94,27 @@ def read_pieces(
         editions: category -> edition; categories not named are guessed by the blocks that come first.
         framing: one of `saltus.framing.NAMES`; None has it guessed.
         most: bytes read, from the beginning; None = all.
+        apart: SAC and SIC of sources that are told apart by channel; others are where the beginning says so.
         progress: called with the file's name and the fraction read.
 
     Yields:
         Pieces with records, and last a part without reports: what could not be read, and how the file is framed.
     """
-    return pieces_of(Stream(path, editions, framing), date, most=most, progress=progress)
+    found = channels_apart(Stream(path, editions, framing, apart=apart), date)
+    return pieces_of(Stream(path, editions, framing, apart=found), date, most=most, progress=progress)
+
+
+def channels_apart(stream: Stream, date: datetime.date | None) -> frozenset[tuple[int, int]]:
+    """SAC and SIC of sources that the channel tells apart: those named, and what the beginning of a recording says.
+
+    Args:
+        stream: the recording, not begun.
+        date: of its first record.
+    """
+    if stream.path.stat().st_size:
+        for _ in pieces_of(stream, date, most=_BEGINNING):
+            pass
+    return stream.apart | stream.found_apart
 
 
 def pieces_of(
@@ -123,7 +143,7 @@ def pieces_of(
     if not path.stat().st_size:
         raise DataError(f"{path}: byte 0: the file is empty.")
     clock, broken, order = Clock(date, name), _Broken(name), Stretches()
-    assembler = Assembler(name, clock, before)
+    assembler = Assembler(name, clock, before, stream.apart)
     first: dict[int, int] = {}  # byte of the first block of each category
     empty = True
     for piece in stream.pieces(most=most, blocks=blocks, progress=progress):
@@ -135,7 +155,7 @@ def pieces_of(
         if any(len(f) for f in found.values()):
             empty = False
             notes = {n: (c.note,) if c.note else () for n, c in stream.chosen.items()}
-            part = assembler.part(found, notes, dated=all(some.dated for some, _ in piece.values()))
+            part = assembler.part(found, notes, stream.channels, dated=all(some.dated for some, _ in piece.values()))
             index = block_times(piece, assembler.read, assembler.times)
             order.add(index.at, index.time, index.category.astype(np.int64) << 16 | index.source)
             yield part
@@ -148,6 +168,8 @@ def pieces_of(
         raise DataError(f"{path}: no ASTERIX record could be read: wrong format, category or edition?{said}")
     lines = tuple(_unread(name, number, note) for number, note in unread.items())
     problems += clock.problems
+    problems += assembler.same_code.problems(name, stream.channels, stream.apart)
+    stream.found_apart = assembler.same_code.apart() - stream.apart
     file = replace(about_file(path, stream.told, most), order=order_words(order.finish()))
     yield Part(Plots.build(0, (), (name,), {}), None, lines, tuple(problems), True, clock.captured, file)
 

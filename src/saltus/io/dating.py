@@ -2,7 +2,7 @@
 
 import datetime
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,13 +30,27 @@ class Read:
     system_of: npt.NDArray[np.int64]  # of each record
 
 
-def read_records(category: Category, found: Found) -> Read:
-    """What becomes of the records of a category."""
+def read_records(
+    category: Category, found: Found, apart: Mapping[int, str] | None = None, codes: Collection[tuple[int, int]] = ()
+) -> Read:
+    """What becomes of the records of a category.
+
+    Args:
+        category: what it takes.
+        found: its records.
+        apart: names of channels by number.
+        codes: SAC and SIC of the sources that are told apart by channel.
+    """
     first, stop = found.columns.spans(SOURCE).T
     octets = found.data
     word = octets[first].astype(np.int64) << 8 | octets[np.minimum(first + 1, stop - 1)]
-    values, which = np.unique(word, return_inverse=True)
-    systems = [System(category.number, int(v) >> 8, int(v) & 255) for v in values]
+    split = np.isin(word, [sac << 8 | sic for sac, sic in codes])
+    values, which = np.unique(word << 32 | np.where(split, found.channel + 1, 0), return_inverse=True)
+    names = apart or {}
+    systems = [
+        System(category.number, int(v) >> 40, int(v) >> 32 & 255, channel=names.get((int(v) & 0xFFFFFFFF) - 1, ""))
+        for v in values
+    ]
     return Read(category, found, _possible(category.decode(found.columns)), systems, which.astype(np.int64))
 
 

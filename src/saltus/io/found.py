@@ -25,6 +25,7 @@ class Found:
     columns: Columns
     sequence: npt.NDArray[np.int64]  # rises in the order in which all records of the recording came
     clock: npt.NDArray[np.float64]  # s, UTC, when each was captured, NaN = not known
+    channel: npt.NDArray[np.int32]  # that brought each, -1 = not told
     faults: Faults
 
     def __len__(self) -> int:
@@ -45,4 +46,13 @@ def find(category: Category, edition: str, blocks: Blocks, place: npt.NDArray[np
     records, faults = find_records(blocks.data, blocks.offset, blocks.length, form)
     columns = read_columns(blocks.data, records, form, category.fields)
     sequence = place[records.block] * _MOST + records.number
-    return Found(form, blocks.data, records, columns, sequence, blocks.clock[records.block], faults)
+    return Found(
+        form,
+        blocks.data,
+        records,
+        columns,
+        sequence,
+        blocks.clock[records.block],
+        blocks.channel[records.block],
+        faults,
+    )

@@ -19,7 +19,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from saltus.errors import DataError
-from saltus.io.asterix import PER_REPORT, about_file, pieces_of, told_dateless
+from saltus.io.asterix import PER_REPORT, about_file, channels_apart, pieces_of, told_dateless
 from saltus.io.clock import DAY, SORTING_WINDOW, ClockJudge, OrderFaults
 from saltus.io.contents import Tally
 from saltus.io.dating import Clock
@@ -83,9 +83,12 @@ def asterix_runs(path: Path, number: int, told: Told, progress: Progress | None)
         order.add(index.at, index.time, index.category.astype(np.int64) << 16 | index.source)
     found = order.finish()
     captured = clock.captured and not clock.dateless
+    apart = told.apart
+    if len(stream.channels) > 1:
+        apart = channels_apart(Stream(path, told.editions, told.framing, stream.chosen, apart), told.date)
 
     def stream_again() -> Stream:
-        return Stream(path, told.editions, told.framing, stream.chosen)
+        return Stream(path, told.editions, told.framing, stream.chosen, apart)
 
     if len(found) < 2:
         start, lag = (found[0].time_from, found[0].lag) if found else (-np.inf, 0.0)

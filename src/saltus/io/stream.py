@@ -28,6 +28,7 @@ class Stream:
         editions: Mapping[int, str],
         framing: str | None = None,
         chosen: Mapping[int, Chosen] | None = None,
+        apart: Iterable[tuple[int, int]] = (),
     ) -> None:
         """Begin a file.
 
@@ -36,6 +37,7 @@ class Stream:
             editions: category -> edition; categories not named are guessed by the blocks that come first.
             framing: one of `saltus.framing.NAMES`; None has it guessed.
             chosen: guesses that stand, of an earlier reading.
+            apart: SAC and SIC of sources that an earlier reading has found to be several, one on each channel.
         """
         self.path = path
         self.chosen: dict[int, Chosen] = dict(chosen or {})
@@ -46,6 +48,13 @@ class Stream:
         self._sample: dict[int, Blocks] = {}
         self._framer = Framer(path.name, credible, framing=framing)
         self.told = self._framer.told
+        self.apart: frozenset[tuple[int, int]] = frozenset(apart)
+        self.found_apart: frozenset[tuple[int, int]] = frozenset()  # others that turned out to be several
+
+    @property
+    def channels(self) -> list[str]:
+        """Names of the channels so far."""
+        return self._framer.channels
 
     def pieces(
         self,

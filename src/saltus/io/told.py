@@ -19,3 +19,4 @@ class Told(NamedTuple):
     framing: str | None = None  # one of `saltus.framing.NAMES`; None has it guessed
     settings: ReadingSettings = ReadingSettings()  # bounds of reading
     most: int | None = None  # bytes read of an ASTERIX file, from the beginning; None = all
+    apart: frozenset[tuple[int, int]] = frozenset()  # SAC and SIC of the sources that the channel tells apart

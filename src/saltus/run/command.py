@@ -119,6 +119,7 @@ def write_tracks(
         framing=config.framing,
         progress=bar.reading,
         settings=config.reading,
+        apart=config.apart,
     )
     decoded = time.perf_counter()
     recording = replace(recording, plots=windowed(recording.plots, given.time_from, given.time_to))

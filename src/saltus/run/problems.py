@@ -45,6 +45,7 @@ def site_wanted(source: Source, count: int) -> str:
     """Say that a source's site must be configured."""
     system = source.system
     keys = f"sac = {system.sac}, sic = {system.sic}" if system.category is not None else f'name = "{system.name}"'
+    keys += f', channel = "{system.channel}"' if system.channel else ""
     moving = "" if system.category is not None else " A sensor that moves tells its own place: see observer_latitude."
     return (
         f"{system}: {count} reports are relative to a site whose position is not configured. Give it in a file "

@@ -1,0 +1,155 @@
+"""Two sensors that send one SAC/SIC: found by what no single one could see, told apart by the channel of each.
+
+A target that two radars see from different sites jumps between two places, relative to one of them, from each report to
+the next; antennas that turn side by side pass north at times of two rhythms. Where each channel by itself has neither,
+the channels are the sensors.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from saltus.records import Kind, Plots
+
+__all__ = ["SameCode"]
+
+_NEAR, _FAST, _SOON = 3000.0, 1000.0, 30.0  # m, m/s, s: how far a target is at most from where it was within a while
+_PAIRS, _MANY, _FEW = 20, 0.25, 0.05  # pairs looked at; shares of impossible ones that tell two sensors, and one
+_TURNS, _UNEVEN, _EVEN = 8, 0.1, 0.03  # intervals between north marks, and shares of their median
+_Times = npt.NDArray[np.float64]
+_Index = npt.NDArray[np.int64]
+
+
+@dataclass(slots=True)
+class _Evidence:
+    """Counts over all reports of one code, and over those of each channel by itself."""
+
+    pairs: int = 0
+    jumps: int = 0
+    pairs_by_channel: int = 0
+    jumps_by_channel: int = 0
+    norths: int = 0  # intervals in pieces in which the north marks are of two rhythms
+    norths_by_channel: int = 0
+    channels: set[int] = field(default_factory=set)
+
+    def two(self) -> bool:
+        """Whether two sensors send the code."""
+        return (self.pairs >= _PAIRS and self.jumps > _MANY * self.pairs) or self.norths >= _TURNS
+
+    def by_channel(self) -> bool:
+        """Whether each channel is one sensor."""
+        one = self.jumps_by_channel <= _FEW * max(self.pairs_by_channel, 1) and self.norths_by_channel < _TURNS
+        return len(self.channels) > 1 and one
+
+
+class SameCode:
+    """Gathers evidence, piece after piece of a recording."""
+
+    def __init__(self) -> None:
+        self._evidence: dict[tuple[int, int], _Evidence] = {}  # by SAC and SIC
+
+    def add(self, plots: Plots, channel: _Index) -> None:
+        """Look at the reports of a category.
+
+        Args:
+            plots: of it, in the order received.
+            channel: that brought each, -1 = not told, (N,).
+        """
+        codes = {(s.system.sac or 0, s.system.sic or 0) for s in plots.sources}
+        for code in sorted(codes):
+            some = [k for k, s in enumerate(plots.sources) if (s.system.sac or 0, s.system.sic or 0) == code]
+            mine = (
+                np.isin(plots.source, some) & (plots.kind == Kind.POLAR) & (plots.reason == 0) & np.isfinite(plots.time)
+            )
+            index = np.flatnonzero(mine & (plots.icao24 >= 0))
+            if len(index) < _PAIRS:
+                index = np.flatnonzero(mine & (plots.mode3a > 0))
+            if not len(index):
+                continue
+            own, of = plots.take(index), channel[index]
+            seen = self._evidence.setdefault(code, _Evidence())
+            seen.channels |= set(np.unique(of).tolist())
+            who = np.where(own.icao24 >= 0, own.icao24.astype(np.int64), (1 << 24) + own.mode3a.astype(np.int64))
+            pairs, jumps = _jumps(own, who)
+            seen.pairs, seen.jumps = seen.pairs + pairs, seen.jumps + jumps
+            pairs, jumps = _jumps(own, who << 20 | (of + 1))
+            seen.pairs_by_channel += pairs
+            seen.jumps_by_channel += jumps
+
+    def turns(self, code: tuple[int, int], time: _Times, channel: _Index) -> None:
+        """Look at the north marks of a code.
+
+        Args:
+            code: SAC and SIC.
+            time: of its north marks, s, (N,).
+            channel: that brought each, (N,).
+        """
+        seen = self._evidence.setdefault(code, _Evidence())
+        seen.channels |= set(np.unique(channel).tolist())
+        seen.norths += _two_rhythms(time)
+        seen.norths_by_channel += sum(_two_rhythms(time[channel == c]) for c in np.unique(channel).tolist())
+
+    def apart(self) -> frozenset[tuple[int, int]]:
+        """SAC and SIC of the codes whose channels are sensors of their own."""
+        return frozenset(code for code, e in self._evidence.items() if e.two() and e.by_channel())
+
+    def problems(self, name: str, channels: Sequence[str], kept: Iterable[tuple[int, int]]) -> list[str]:
+        """What is told of the codes that two sensors send.
+
+        Args:
+            name: of the recording.
+            channels: names of the channels.
+            kept: codes whose channels were kept apart.
+        """
+        return [
+            _told(name, code, e, [channels[c] for c in sorted(e.channels) if c >= 0], apart=code in kept)
+            for code, e in self._evidence.items()
+            if e.two()
+        ]
+
+
+def _told(name: str, code: tuple[int, int], e: _Evidence, channels: Sequence[str], *, apart: bool) -> str:
+    sac, sic = code
+    why = (
+        f"of {e.pairs} times that a target was reported again, {e.jumps} were where it cannot have flown"
+        if e.pairs >= _PAIRS and e.jumps > _MANY * e.pairs
+        else "its north marks are those of two antennas"
+    )
+    if apart:
+        first = channels[0]
+        return (
+            f"{name}: SAC/SIC {sac}/{sic} is sent by {len(channels)} sensors: {why}. They are kept apart by channel: "
+            f"{', '.join(channels)}. Give each a [[sensor]] table of its own, with sac, sic and "
+            f'channel = "{first}" and so on.'
+        )
+    where = "nothing in the recording tells them apart" if len(channels) < 2 else "its channels do not tell them apart"
+    if e.by_channel():
+        where = "only from some place on"
+    return (
+        f"{name}: SAC/SIC {sac}/{sic} is sent by two sensors: {why}, and {where}: they are used as if they were one. "
+        "Correct the code of one at its source, or record each on a line or port of its own."
+    )
+
+
+def _jumps(plots: Plots, who: _Index) -> tuple[int, int]:
+    """Pairs of successive reports of one target, and those between which it cannot have flown."""
+    order = np.lexsort((plots.time, who))
+    same = np.diff(who[order]) == 0
+    wait = np.diff(plots.time[order])
+    east, north = (plots.range * f(plots.azimuth) for f in (np.sin, np.cos))
+    way = np.hypot(np.diff(east[order]), np.diff(north[order]))
+    soon = same & (wait < _SOON) & np.isfinite(way)
+    return int(np.count_nonzero(soon)), int(np.count_nonzero(soon & (way > _NEAR + _FAST * wait)))
+
+
+def _two_rhythms(time: _Times) -> int:
+    """Intervals between north marks, if they are uneven one by one and even two by two; else 0."""
+    starts = np.unique(time[np.isfinite(time)])
+    if len(starts) < _TURNS + 2:
+        return 0
+    one, two = np.diff(starts), starts[2:] - starts[:-2]
+    uneven = np.mean(np.abs(one - np.median(one)) > _UNEVEN * np.median(one))
+    even = np.mean(np.abs(two - np.median(two)) < _EVEN * np.median(two))
+    return len(one) if uneven > 0.4 and even > 0.8 else 0
