@@ -137,3 +137,48 @@ def in_blocks(category, octets):
         data += bytes([category]) + (len(body) + 3).to_bytes(2, "big") + body
         length.append(len(body) + 3)
     return data, np.array(offset), np.array(length)
+
+
+def parsed(record, data):
+    """What the library makes of bytes as a record: its length in bytes and its fields, or None where it refuses."""
+    try:
+        result = record.parse(base.ParsingMode.StrictParsing, base.Bits.from_bytes(data))
+    except TypeError:  # a field specification longer than the items there are
+        return None
+    if isinstance(result, ValueError):
+        return None
+    found, rest = result
+    fields = {}
+    for name, item in found.items_regular.items():
+        _flatten(item, name, fields)
+    for some in found.items_rfs:
+        for name, item in some or ():
+            _flatten(item, name, fields)
+    return len(data) - len(rest) // 8, fields
+
+
+def _flatten(non_spare, path, fields):
+    rule = non_spare.arg
+    if isinstance(rule, base.RuleVariationDependent):
+        obj, _ = rule.cv_default_variation._parse(rule.bs)
+    else:
+        obj = rule.arg
+    _values(obj, path, fields)
+
+
+def _values(obj, path, fields):
+    if isinstance(obj, base.Element):
+        rule = obj.cv_rule
+        content = rule.cv_content if issubclass(rule, base.RuleContentContextFree) else rule.cv_default_content
+        fields.setdefault(path, []).append((obj.bs.to_uinteger(), obj.cv_bit_size, content))
+    elif isinstance(obj, base.Repetitive):
+        for one in obj.arg:
+            _values(one, path, fields)
+    elif isinstance(obj, base.Compound):
+        for name, item in obj.arg.items():
+            _flatten(item, f"{path}/{name}", fields)
+    elif isinstance(obj, base.Group | base.Extended):
+        parts = obj.arg if isinstance(obj, base.Group) else [item for part in obj.arg for item in part]
+        for item in parts:
+            if isinstance(item, base.Item):
+                _flatten(item.arg, f"{path}/{item.arg.cv_name}", fields)

@@ -11,6 +11,9 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from functools import cache
+from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,19 +22,21 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from saltus.config import load_config
+from saltus.convert import convert_files
 from saltus.diagnose.residuals import from_table
 from saltus.errors import DataError, ModelError
 from saltus.evaluate.tables import read_reference, read_tracks
 from saltus.gap import load_scenario
-from saltus.io import FORMATS, ReadingSettings, read
+from saltus.io import FORMATS, ReadingSettings, read, read_in_order
 from saltus.io.merge import LIMITS
 from saltus.records import REASONS, Kind, Recording
 
 TESTS = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(TESTS / "io"), str(TESTS / "framing")]
+sys.path[:0] = [str(TESTS / "io"), str(TESTS / "framing"), str(TESTS / "asterix")]
 
 import containers_made as made  # noqa: E402
 import frames  # noqa: E402
+from library import Draw, definitions, in_blocks  # noqa: E402
 
 CORPUS = Path(__file__).parent / "corpus"
 LONGEST = 5.0  # s of CPU
@@ -211,6 +216,17 @@ def _asterix() -> dict[str, bytes]:
     }
 
 
+@cache
+def _every_category() -> tuple[bytes, ...]:
+    """Random records of every category and edition, a recording for each, by libasterix."""
+    draw = random.Random(7)
+    found = []
+    for category, _, profile, record in definitions():
+        octets = [Draw(draw, category).record(record, profile) for _ in range(6)]
+        found.append(in_blocks(category, octets)[0])
+    return tuple(found)
+
+
 def _table(n: int = 40) -> dict[str, list[object]]:
     draw = np.random.default_rng(5)
     return {
@@ -319,6 +335,23 @@ def _record(path: Path) -> Recording:
     return read([path], settings=SETTINGS)
 
 
+def _ordered(path: Path) -> object:
+    """Read in order of time; usable reports never go back."""
+    newest, n = -np.inf, 0
+    for found in read_in_order([path], settings=SETTINGS):
+        time = found.plots.time[found.plots.reason == 0]
+        if len(time) and (time[0] < newest or np.any(np.diff(time) < 0)):
+            raise Failed("reports are out of order")
+        newest = max([newest, *time[-1:].tolist()])
+        n += len(time)
+    return n
+
+
+def _converted(path: Path) -> object:
+    with redirect_stdout(StringIO()):
+        return convert_files([path], path.with_suffix(".jsonl"))
+
+
 def _residuals(path: Path) -> object:
     return from_table(path, ["latitude", "altitude_m"], "source")
 
@@ -339,6 +372,9 @@ def targets() -> dict[str, Target]:
         Target("mixed", ".ast", (b"".join(plain.values()),), _BYTES, _record),
         Target("capture", ".pcap", captures, _BYTES, _record),
         Target("container", ".raw", contained, _BYTES, _record),
+        Target("categories", ".ast", _every_category(), _BYTES, _record),
+        Target("ordered", ".pcap", (*captures, captures[0] + captures[1], *contained), _BYTES, _ordered),
+        Target("converted", ".ast", (plain["cat048"], *_every_category()[:6]), _BYTES, _converted),
         Target("csv", ".csv", (_csv(table), _csv(table, "\r\n")), _CELLS, _record),
         Target("parquet", ".parquet", parquet, _CELLS, _record),
         Target("truth", ".csv", (_csv(_TRUTH),), _CELLS, read_reference),

@@ -111,3 +111,27 @@ def test_field_cases(request):
     assert np.degrees([bad.plots.latitude[0], bad.plots.longitude[0]]) == pytest.approx([41.904, 3.030], abs=1e-3)
     assert bad.plots.altitude[0] == pytest.approx(37000 * 0.3048)
     assert any("RE" in p for p in bad.problems)
+
+
+def test_values_that_make_no_sense_do_not_speak_for_an_edition_that_explains_nothing():
+    """A test pattern: times past the end of the day, latitudes beyond the poles, by 2.1 alone to be parsed."""
+    times, position = "ffffff", "7fffffff7fffffff"
+    values = {
+        "010": "14db",
+        "040": "00",
+        "131": position,
+        "080": "ffffff",
+        "073": times,
+        "145": "7fff",
+        "170": "ff" * 6,
+    }
+    names = [child.path if child else "" for child in layout(21, "2.1").records[""].children]
+    flags = bytearray(5)
+    for name in values:
+        flags[names.index(name) // 7] |= 0x80 >> names.index(name) % 7
+    for k in range(4):
+        flags[k] |= 1
+    pattern = cat021(flags.hex() + "".join(values[n] for n in names if n in values))
+    chosen = choose_edition(21, blocks(pattern, pattern), None, "a")
+    assert chosen.edition == "2.1"
+    assert next(w for w in chosen.weighed if w.edition == "2.1").share == 1.0

@@ -159,7 +159,8 @@ def pieces_of(
             index = block_times(piece, assembler.read, assembler.times)
             order.add(index.at, index.time, index.category.astype(np.int64) << 16 | index.source)
             yield part
-    unread = {n: f"{stream.n_blocks[n]} blocks; {c.note}" for n, c in sorted(stream.chosen.items()) if not c.edition}
+    unread = {n: f"{stream.n_blocks[n]} blocks; {stream.chosen[n].note}" for n in first if not stream.chosen[n].edition}
+    unread = dict(sorted(unread.items()))
     problems = _problems(name, stream, unread, first, broken)
     if not empty and clock.dateless:
         problems.append(told_dateless(name))

@@ -109,9 +109,14 @@ class Columns:
         return np.where((values < 0) & self.has(beside), 0, values)
 
     def text(self, path: str) -> Texts:
-        """A text without blanks around it, (N,)."""
+        """A text without blanks around it, (N,); one that has a byte that is no letter of ASCII is lost."""
         column = self._held.get(path)
-        return np.full(self.n, "", "U8") if column is None else column.values.astype("U8")
+        if column is None or column.values.dtype.kind != "S":
+            return np.full(self.n, "", "U8")
+        width = column.values.dtype.itemsize
+        octets = np.ascontiguousarray(column.values).view(np.uint8).reshape(self.n, width)
+        odd = ((octets >= 0x7F) | (octets < 0x20) & (octets > 0)).any(axis=1)
+        return np.where(odd, b"", column.values).astype("U8")
 
     def spans(self, item: str) -> npt.NDArray[np.int64]:
         """Where an item starts and stops in the buffer, (N, 2)."""

@@ -16,6 +16,7 @@ __all__ = ["SAMPLE", "Chosen", "Weighed", "choose_edition", "weigh"]
 
 SAMPLE = 200  # blocks looked at
 _FITS, _ENOUGH = 0.5, 20  # an edition that explains less of this many blocks is not theirs
+_PART = 0.5  # of what the best explains, that an edition must explain to be weighed by its values
 _SURELY = 0.9  # an edition that explains as much is theirs, where the one asked for is not
 _FOLLOWS, _LUCK = 0.97, 0.3  # blocks that follow their own edition, and another one
 _HURT = 0.9  # what a block counts whose records are all kept, one without its broken item
@@ -65,7 +66,10 @@ def choose_edition(number: int, blocks: Blocks, asked: str | None, name: str) ->
     whole = np.flatnonzero(~blocks.cut) if not blocks.cut.all() else np.arange(len(blocks))
     sample = blocks.take(whole[:: max(1, len(whole) // SAMPLE)][:SAMPLE])
     weighed = tuple(weigh(number, edition, sample) for edition in reversed(known))
-    best = max(weighed, key=lambda w: (w.nats, w.edition == _COMMONEST.get(number)))  # the newest of equals
+    # Values that make no sense speak against an edition, but not for one that explains nothing.
+    most = max(w.share for w in weighed)
+    some = [w for w in weighed if w.share >= _PART * most]
+    best = max(some, key=lambda w: (w.nats, w.edition == _COMMONEST.get(number)))  # the newest of equals
     if asked is not None:
         _check_asked(number, next(w for w in weighed if w.edition == asked), best, len(sample), name)
         return Chosen(asked, "", weighed)
