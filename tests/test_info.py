@@ -207,7 +207,7 @@ def levels(*some):
 
 def test_targets_by_what_tells_them_apart_best():
     assert targets(plots(icao24=[1, 2, 2, -1, -1], mode3a=[7, 7, 7, 8, -1])) == (
-        "2 by Mode S address, 1 by Mode 3/A code of those without; 1 reports without identity"
+        "2 by Mode S address, 1 by Mode 3/A code of those without; 1 report without identity"
     )
     assert targets(plots(icao24=[1, 2]), plots(icao24=[2, 3])) == "3 by Mode S address"
     assert targets(plots(local_id=[5, 6, 6])) == "2 by the system's own track numbers"

@@ -4,7 +4,7 @@ import datetime
 
 import numpy as np
 import pytest
-from frames import NORTH, PLOT, plot
+from frames import NORTH, PLOT, capture, plot
 
 from saltus.asterix.layout import categories, editions, layout
 from saltus.errors import DataError
@@ -230,6 +230,28 @@ def test_old_radar_without_a_clock_has_no_time(tmp_path):
     got = load(tmp_path, block(1, "fa 1402 20 0500 4000 029c 0190 4080"))
     assert reasons(got) == ["no time"]
     assert "tell their time modulo 512 s only" in got.problems[0]
+
+
+def test_old_radar_that_tells_no_time_is_dated_by_what_recorded_it(tmp_path):
+    """Reports without I001/141, in a capture."""
+    report = block(1, "f8 1402 20 0500 4000 029c 0190")  # 010 020 040 070 090
+    path = tmp_path / "a.pcap"
+    path.write_bytes(capture([report] * 3, start=1_714_557_600.25, step=1.0))
+    got = read([path])
+    assert got.plots.time.tolist() == [1_714_557_600.25 + k for k in range(3)]
+    assert reasons(got) == [""] * 3
+    assert got.problems == ("a.pcap: 3 reports of category 1 tell no time: the clock that recorded them dates them.",)
+
+
+def test_what_has_no_table_is_refused_with_what_to_do(tmp_path):
+    got = load(tmp_path, PLOT, block(30, "80 1402"))
+    assert any("CAT030 is the former format of system tracks" in p and "CAT062" in p for p in got.problems)
+    rng = np.random.default_rng(4)
+    odd = [block(62, "bf01" + rng.bytes(30).hex()) for _ in range(30)]
+    got = load(tmp_path, PLOT, *odd)
+    (said,) = (p for p in got.problems if "category 62 is not read" in p)
+    assert "30 blocks; none of the editions 1.16" in said
+    assert "Editions of CAT062 before 1.16 have no public table: have the centre send 1.16 or later." in said
 
 
 def test_plots_and_tracks_of_an_old_radar_in_one_block(tmp_path):

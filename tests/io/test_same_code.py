@@ -90,6 +90,20 @@ def test_two_antennas_at_one_site_are_told_by_their_north_marks(tmp_path):
     assert {s.system.channel for s in got.plots.sources} == {"board 1 line 1", "board 1 line 2"}
 
 
+def test_codes_that_several_aircraft_share_are_no_second_sensor(tmp_path):
+    """Five aircraft with Mode 3/A 7000 and one with 1234, without addresses: 010 140 020 040 070 090."""
+    plots = []
+    for k in range(60):
+        for n in range(6):
+            body = f"1481 {round((36_000 + TURN * k + n / 2) * 128):06x} 40 {2560 + 999 * n:04x}{9000 * n:04x}"
+            record = bytes.fromhex("fc" + body + ("0e00" if n else "029c") + "0190")
+            plots.append(b"\x30" + (3 + len(record)).to_bytes(2, "big") + record)
+    (tmp_path / "a.ast").write_bytes(b"".join(plots))
+    got = read([tmp_path / "a.ast"])
+    assert (got.plots.reason == 0).all()
+    assert not any("SAC/SIC" in p for p in got.problems)
+
+
 def test_one_radar_on_two_lines_is_one(tmp_path):
     """Redundant lines repeat every block; a radar may also send every other block on each."""
     alone = [body for _, body in sorted(radar(SITES[0], 60))]

@@ -213,7 +213,9 @@ def _span(line: Contents) -> str:
     if np.isnan(line.time_from):
         return "not told"
     seconds = line.time_to - line.time_from
-    length = f"{seconds / 60:.1f} min" if seconds >= 60 else f"{seconds:.3f} s"
+    sizes = ((2 * _DAY, _DAY, "days"), (7200.0, 3600.0, "h"), (60.0, 60.0, "min"))
+    lengths = [f"{seconds / unit:.1f} {name}" for least, unit, name in sizes if seconds >= least]
+    length = lengths[0] if lengths else f"{seconds:.3f} s"
     return f"{_moment(line.time_from)} to {_moment(line.time_to)} UTC ({length})"
 
 

@@ -81,7 +81,8 @@ class Figures:
         if not told:
             return "cannot be told: no report carries an identity"
         more = "".join(f", {text} of those without" for text in told[1:])
-        return told[0] + more + (f"; {self._nameless} reports without identity" if self._nameless else "")
+        rest = f"{self._nameless} report{'' if self._nameless == 1 else 's'} without identity"
+        return told[0] + more + (f"; {rest}" if self._nameless else "")
 
     def extents(self) -> list[str]:
         """Where the reports are, for each kind of position there is."""

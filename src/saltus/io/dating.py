@@ -82,9 +82,8 @@ class Clock:
         self._started = False
         self.captured = False  # the clock of a capture told the days of the last piece
         self.dateless = False  # days count from 1970-01-01
-        self._lost: Counter[tuple[int, float]] = (
-            Counter()
-        )  # records by category and modulus whose time nothing completes
+        self._lost: Counter[tuple[int, float]] = Counter()  # by category and modulus: times that nothing completes
+        self._silent: Counter[int] = Counter()  # by category: reports without a time, dated by what recorded them
 
     @property
     def problems(self) -> list[str]:
@@ -94,6 +93,10 @@ class Clock:
             f"message of category {CATEGORIES[number].turns} of their source nor a capture clock completes it: they "
             "have no time. Record the service messages too, or capture packets."
             for (number, modulus), n in self._lost.items()
+        ] + [
+            f"{self._name}: {n} reports of category {number} tell no time: the clock that recorded them dates them."
+            for number, n in self._silent.items()
+            if n
         ]
 
     def times(self, read: Mapping[int, Read], *, dated: bool) -> dict[int, npt.NDArray[np.float64]]:
@@ -163,6 +166,9 @@ class Clock:
         if not modulus:
             return r.decoded.time_of_day
         time = complete(r.decoded.time_of_day, modulus, self._reference(number, read))
+        silent = np.isnan(r.decoded.time_of_day) & np.isfinite(r.found.clock) & r.decoded.is_report
+        time[silent] = r.found.clock[silent] % DAY
+        self._silent[number] += int(np.count_nonzero(silent))
         lost = int(np.count_nonzero(np.isnan(time) & ~np.isnan(r.decoded.time_of_day)))
         if lost:
             self._lost[number, modulus] += lost

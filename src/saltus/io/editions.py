@@ -21,6 +21,12 @@ _SURELY = 0.9  # an edition that explains as much is theirs, where the one asked
 _FOLLOWS, _LUCK = 0.97, 0.3  # blocks that follow their own edition, and another one
 _HURT = 0.9  # what a block counts whose records are all kept, one without its broken item
 _HEADER = 3  # bytes
+# What to do about categories and editions of which there is no table, besides the common advice.
+_ASK = {
+    21: "Editions 1.x of CAT021 have no public table: have the station send 2.1 or later, or 0.23.",
+    30: "CAT030 is the former format of system tracks, without a public table: have the centre send CAT062.",
+    62: "Editions of CAT062 before 1.16 have no public table: have the centre send 1.16 or later.",
+}
 _COMMONEST = {21: "2.1"}  # what most stations send, taken among equals: later ones extend it
 
 
@@ -58,7 +64,7 @@ def choose_edition(number: int, blocks: Blocks, asked: str | None, name: str) ->
     """
     known = editions(number)
     if not known:
-        return Chosen("", "no definition of it is known.", ())
+        return Chosen("", " ".join(["no definition of it is known.", *_asked(number)]), ())
     if asked is not None and asked not in known:
         raise DataError(
             f"edition {asked!r} of category {number} is not known; choose one of {', '.join(known)} in [editions]."
@@ -114,11 +120,16 @@ def _check_asked(number: int, asked: Weighed, best: Weighed, n: int, name: str) 
 def _none_fits(number: int, weighed: Sequence[Weighed]) -> str:
     best = max(weighed, key=lambda w: w.share)
     names = ", ".join(w.edition for w in reversed(weighed))
-    return (
+    said = (
         f"none of the editions {names} explains more than {best.share:.0%} of their bytes, of whose values "
         f"{best.sense:.0%} make sense. If it is another edition, it cannot be read; to see what there is, write "
         f'{number} = "{best.edition}" in [editions].'
     )
+    return " ".join([said, *_asked(number)])
+
+
+def _asked(number: int) -> list[str]:
+    return [_ASK[number]] if number in _ASK else []
 
 
 def _said(weighed: Sequence[Weighed], best: Weighed) -> str:

@@ -16,7 +16,8 @@ from saltus.records import Kind, Plots
 __all__ = ["SameCode"]
 
 _NEAR, _FAST, _SOON = 3000.0, 1000.0, 30.0  # m, m/s, s: how far a target is at most from where it was within a while
-_PAIRS, _MANY, _FEW = 20, 0.25, 0.05  # pairs looked at; shares of impossible ones that tell two sensors, and one
+_PAIRS, _ADDRESSES, _CODES = 6, 2, 10  # times that a target must come again; targets that tell, by address and by code
+_MANY, _FEW = 0.5, 0.1  # shares of targets that jump, by which there are two sensors, and one
 _TURNS, _UNEVEN, _EVEN = 8, 0.1, 0.03  # intervals between north marks, and shares of their median
 _Times = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
@@ -26,21 +27,27 @@ _Index = npt.NDArray[np.int64]
 class _Evidence:
     """Counts over all reports of one code, and over those of each channel by itself."""
 
-    pairs: int = 0
+    targets: float = 0.0  # that came again often enough, over as many as are needed
+    jumping: float = 0.0
+    pairs: int = 0  # of their successive reports
     jumps: int = 0
-    pairs_by_channel: int = 0
-    jumps_by_channel: int = 0
+    targets_by_channel: float = 0.0
+    jumping_by_channel: float = 0.0
     norths: int = 0  # intervals in pieces in which the north marks are of two rhythms
     norths_by_channel: int = 0
     channels: set[int] = field(default_factory=set)
 
     def two(self) -> bool:
         """Whether two sensors send the code."""
-        return (self.pairs >= _PAIRS and self.jumps > _MANY * self.pairs) or self.norths >= _TURNS
+        return self.jump() or self.norths >= _TURNS
+
+    def jump(self) -> bool:
+        """Whether targets are where they cannot have flown."""
+        return self.targets >= 1.0 and self.jumping > _MANY * self.targets
 
     def by_channel(self) -> bool:
         """Whether each channel is one sensor."""
-        one = self.jumps_by_channel <= _FEW * max(self.pairs_by_channel, 1) and self.norths_by_channel < _TURNS
+        one = self.jumping_by_channel <= _FEW * self.targets_by_channel and self.norths_by_channel < _TURNS
         return len(self.channels) > 1 and one
 
 
@@ -64,8 +71,9 @@ class SameCode:
                 np.isin(plots.source, some) & (plots.kind == Kind.POLAR) & (plots.reason == 0) & np.isfinite(plots.time)
             )
             index = np.flatnonzero(mine & (plots.icao24 >= 0))
+            need = _ADDRESSES
             if len(index) < _PAIRS:
-                index = np.flatnonzero(mine & (plots.mode3a > 0))
+                index, need = np.flatnonzero(mine & (plots.mode3a > 0)), _CODES
             if not len(index):
                 continue
             own, of = plots.take(index), channel[index]
@@ -73,10 +81,12 @@ class SameCode:
             seen.channels |= set(np.unique(of).tolist())
             who = np.where(own.icao24 >= 0, own.icao24.astype(np.int64), (1 << 24) + own.mode3a.astype(np.int64))
             pairs, jumps = _jumps(own, who)
-            seen.pairs, seen.jumps = seen.pairs + pairs, seen.jumps + jumps
+            seen.pairs, seen.jumps = seen.pairs + int(pairs.sum()), seen.jumps + int(jumps.sum())
+            seen.targets += len(pairs) / need
+            seen.jumping += int(np.count_nonzero(jumps > _MANY * pairs)) / need
             pairs, jumps = _jumps(own, who << 20 | (of + 1))
-            seen.pairs_by_channel += pairs
-            seen.jumps_by_channel += jumps
+            seen.targets_by_channel += len(pairs) / need
+            seen.jumping_by_channel += int(np.count_nonzero(jumps > _MANY * pairs)) / need
 
     def turns(self, code: tuple[int, int], time: _Times, channel: _Index) -> None:
         """Look at the north marks of a code.
@@ -114,7 +124,7 @@ def _told(name: str, code: tuple[int, int], e: _Evidence, channels: Sequence[str
     sac, sic = code
     why = (
         f"of {e.pairs} times that a target was reported again, {e.jumps} were where it cannot have flown"
-        if e.pairs >= _PAIRS and e.jumps > _MANY * e.pairs
+        if e.jump()
         else "its north marks are those of two antennas"
     )
     if apart:
@@ -133,15 +143,18 @@ def _told(name: str, code: tuple[int, int], e: _Evidence, channels: Sequence[str
     )
 
 
-def _jumps(plots: Plots, who: _Index) -> tuple[int, int]:
-    """Pairs of successive reports of one target, and those between which it cannot have flown."""
+def _jumps(plots: Plots, who: _Index) -> tuple[_Index, _Index]:
+    """Of each target that comes again often enough: pairs of successive reports, and those it cannot have flown."""
     order = np.lexsort((plots.time, who))
-    same = np.diff(who[order]) == 0
     wait = np.diff(plots.time[order])
     east, north = (plots.range * f(plots.azimuth) for f in (np.sin, np.cos))
     way = np.hypot(np.diff(east[order]), np.diff(north[order]))
-    soon = same & (wait < _SOON) & np.isfinite(way)
-    return int(np.count_nonzero(soon)), int(np.count_nonzero(soon & (way > _NEAR + _FAST * wait)))
+    soon = (np.diff(who[order]) == 0) & (wait < _SOON) & np.isfinite(way)
+    target, pairs = np.unique(who[order][1:][soon], return_counts=True)
+    place = np.searchsorted(target, who[order][1:][soon])
+    jumps = np.bincount(place[(way > _NEAR + _FAST * wait)[soon]], minlength=len(target))
+    often = pairs >= _PAIRS
+    return pairs[often], jumps[often]
 
 
 def _two_rhythms(time: _Times) -> int:
