@@ -2,22 +2,38 @@
 
 import numpy as np
 
+from saltus.demo import write_demo
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots, Source, System, Traits
 from saltus.simulate import Leg, Radar, Trajectory, observe
 
 SITES = (Site(*np.radians([48.0, 11.0]).tolist(), 500.0), Site(*np.radians([48.1, 11.4]).tolist(), 300.0))
 PLANE = Plane(SITES[0].latitude, SITES[0].longitude)
-SECONDS = 120.0
+SECONDS = 100.0
 
 
 def radars_toml():
-    """Return the configuration of the radars' sites."""
-    text = ""
+    """Return the configuration of the radars' sites; a minute is the first stretch."""
+    text = "[setup]\nseconds = 60.0\n"
     for sic, site in enumerate(SITES, start=1):
         text += f"[[sensor]]\nsac = 1\nsic = {sic}\nheight = {site.height}\n"
         text += f"latitude = {np.degrees(site.latitude):.9f}\nlongitude = {np.degrees(site.longitude):.9f}\n"
     return text
+
+
+def demo_start(folder, seed, share=0.5):
+    """Write the demonstration's recordings up to a share of their bytes, in whole blocks, and its configuration."""
+    made = write_demo(folder / "scene", seed)
+    files = []
+    for path in made.files:
+        content, end = path.read_bytes(), 0
+        while end < share * len(content):
+            end += int.from_bytes(content[end + 1 : end + 3])
+        files.append(folder / path.name)
+        files[-1].write_bytes(content[:end])
+    config = folder / "config.toml"
+    config.write_text(made.config.read_text() + "\n[setup]\nseconds = 60.0\n")
+    return [*map(str, files)], config
 
 
 def scene(radars, seed=1, seconds=SECONDS):

@@ -93,14 +93,14 @@ def test_an_intake_restored_goes_on(rng):
 
 @pytest.mark.parametrize("chunk", [1, 777, 100_000])
 def test_the_first_stretch_ends_when_every_source_gave_enough(chunk):
-    """A gives twenty reports a second, B one: 600 s pass before B gave 5 000; alone, A's 5 000th ends it."""
-    a, b = np.arange(0.0, 1200.0, 0.05), np.arange(0.1, 1200.0, 1.0)
+    """A gives twenty reports a second, B one: 60 s pass before B gave 500; alone, A's 500th ends it."""
+    a, b = np.arange(0.0, 120.0, 0.05), np.arange(0.1, 120.0, 1.0)
     for time, source, length in (
-        (a, np.zeros(len(a), int), 5000),
-        (np.concatenate([a, b]), np.repeat([0, 1], [len(a), len(b)]), 12001 + 600),
+        (a, np.zeros(len(a), int), 500),
+        (np.concatenate([a, b]), np.repeat([0, 1], [len(a), len(b)]), 1201 + 60),
     ):
         order = np.argsort(time, kind="stable")
-        plots, taken, stretch = reports(time[order], source[order]), 0, Stretch(SetupSettings())
+        plots, taken, stretch = reports(time[order], source[order]), 0, Stretch(SetupSettings(500, 60.0))
         for begin in range(0, len(plots), chunk):
             part = plots.take(slice(begin, begin + chunk))
             stop = stretch.add(part, np.arange(begin, begin + len(part)))

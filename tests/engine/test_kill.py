@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from engine_scenes import demo_start
 
 from saltus.cli import main
-from saltus.demo import write_demo
 
 TABLES = ("tracks.parquet", "assignments.parquet", "identifications.parquet", "biases.json")
 EVERY = ("--checkpoint-every", "40", "--chunk", "200", "--no-report")
@@ -20,10 +20,8 @@ EVERY = ("--checkpoint-every", "40", "--chunk", "200", "--no-report")
 def recording(tmp_path_factory):
     """A simulated recording of two radars, a minute of it for the setup, and its outputs in one go."""
     folder = tmp_path_factory.mktemp("killed")
-    scene = write_demo(folder / "scene", 5)
-    config = folder / "config.toml"
-    config.write_text(scene.config.read_text() + "\n[setup]\nseconds = 60.0\n")
-    inputs = [*map(str, scene.files), "--config", str(config)]
+    files, config = demo_start(folder, 5)
+    inputs = [*files, "--config", str(config)]
     result = CliRunner().invoke(main, ["track", *inputs, "-o", str(folder / "whole"), "--no-report"])
     assert result.exit_code == 0, result.output
     return folder, inputs
@@ -53,7 +51,7 @@ def test_killed_at_any_moment_and_resumed(recording, tmp_path):
     arguments = [*inputs, "-o", out, "--checkpoint", state, *EVERY]
     resume, codes = [], []
     rng = np.random.default_rng(1)
-    for moment in (*rng.integers(1, 20, 6).tolist(), 10**6):
+    for moment in (*rng.integers(1, 8, 6).tolist(), 10**6):
         run = subprocess.run(
             [sys.executable, "-c", KILLED, str(moment), "track", *map(str, arguments), *resume], capture_output=True
         )
@@ -104,7 +102,7 @@ def test_ctrl_c_saves_the_state(recording, tmp_path):
         "import os, signal; from saltus.engine import Session; feed = Session.feed\n"
         "def fed(self, *rest):\n"
         "    told = feed(self, *rest)\n"
-        "    if self.reports >= 3000: os.kill(os.getpid(), signal.SIGINT)\n"
+        "    if self.reports >= 1500: os.kill(os.getpid(), signal.SIGINT)\n"
         "    return told\n"
         "Session.feed = fed; from saltus.cli import main; main()"
     )
@@ -114,7 +112,7 @@ def test_ctrl_c_saves_the_state(recording, tmp_path):
     assert not out.exists()
     result = CliRunner().invoke(main, ["track", *map(str, arguments), "--resume"])
     assert result.exit_code == 0, result.output
-    assert "went on from report 3000" in result.output
+    assert "went on from report 1500" in result.output
     same_outputs(folder / "whole", out)
 
 

@@ -9,12 +9,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
-from engine_scenes import radars_toml, scene
+from engine_scenes import demo_start, radars_toml, scene
 
 from saltus import Session
 from saltus.cli import main
 from saltus.config import load_config
-from saltus.demo import write_demo
 from saltus.engine.saved import setup_toml
 from saltus.errors import DataError, ModelError
 from saltus.records import Kind, Plots, Source, System
@@ -25,7 +24,7 @@ def saved(tmp_path_factory):
     """A setup learnt from two radars, as a file; what it was learnt from, and how."""
     folder = tmp_path_factory.mktemp("saved")
     config = folder / "sensors.toml"
-    config.write_text("date = 2024-01-31\n[setup]\nseconds = 60.0\n[tracker]\nmax_speed = 350.0\n" + radars_toml())
+    config.write_text("date = 2024-01-31\n[tracker]\nmax_speed = 350.0\n" + radars_toml())
     plots = scene(2)
     session = Session.open(config, hold=0.0)
     session.feed(plots.take(slice(0, 300)))
@@ -125,8 +124,7 @@ def test_learnt_is_a_table(tmp_path):
 
 def test_the_program_learns_a_setup_and_tracks_with_it(tmp_path):
     """What `track` learns by itself, `setup` writes: the same tables to the byte."""
-    scene = write_demo(tmp_path / "scene", 5)
-    inputs = [str(f) for f in scene.files]
+    inputs, config = demo_start(tmp_path, 5)
 
     def run(*arguments):
         result = CliRunner().invoke(main, [*arguments])
@@ -134,11 +132,11 @@ def test_the_program_learns_a_setup_and_tracks_with_it(tmp_path):
         return result.output
 
     file = str(tmp_path / "setup.toml")
-    said = run("setup", *inputs, "--config", str(scene.config), "-o", file)
+    said = run("setup", *inputs, "--config", str(config), "-o", file)
     assert "sigma_range_m" in said and "update period" in said and file in said
     assert "date" not in tomllib.loads(Path(file).read_text())
-    date = ["--date", str(load_config(scene.config).date)]
-    run("track", *inputs, "--config", str(scene.config), "-o", str(tmp_path / "a"), "--no-report")
+    date = ["--date", str(load_config(config).date)]
+    run("track", *inputs, "--config", str(config), "-o", str(tmp_path / "a"), "--no-report")
     run("track", *inputs, "--config", file, *date, "-o", str(tmp_path / "b"), "--no-report")
     for name in ("tracks.parquet", "assignments.parquet", "identifications.parquet"):
         assert pq.read_table(tmp_path / "a" / name).equals(pq.read_table(tmp_path / "b" / name)), name

@@ -180,40 +180,57 @@ class NativeStore:
         mode: _Modes | None = None,
     ) -> None:
         """Mix and propagate rows."""
-
-        def run(F: _Array, b: _Array | None, Q: _Array) -> int:
-            drift = None if b is None else _looked_up(b, mode)
-            return int(self._lanes.step(rows, trans, _looked_up(F, mode), drift, _looked_up(Q, mode)))
-
-        if run(F, b, Q) == _DOUBTFUL:
+        if self._step(rows, trans, F, b, Q, mode) == _DOUBTFUL:
             for c, t in enumerate(trans):
                 finite(f"trans[{c}]", 0.0 if t is None else t)
-            if (
-                run(finite("F", F), None if b is None else finite("b", b), covariances("Q", finite("Q", Q)))
-                == _DOUBTFUL
-            ):
+            F, b, Q = finite("F", F), None if b is None else finite("b", b), covariances("Q", finite("Q", Q))
+            if self._step(rows, trans, F, b, Q, mode) == _DOUBTFUL:
                 raise ModelError("Q is not positive semidefinite. Give covariances, never factors or precisions.")
+
+    def _step(
+        self,
+        rows: _Rows,
+        trans: Sequence[_Array | None],
+        F: _Array,
+        b: _Array | None,
+        Q: _Array,
+        mode: _Modes | None,
+    ) -> int:
+        drift = None if b is None else _looked_up(b, mode)
+        return int(self._lanes.step(rows, trans, _looked_up(F, mode), drift, _looked_up(Q, mode)))
 
     def measure(
         self, rows: _Rows, z: _Array, H: _Array, d: _Array | None, R: _Array, mode: _Modes | None = None, *, write: bool
     ) -> tuple[_Array, _Array]:
         """Return d2 and log f(z); condition the rows when `write`."""
         d2, log_f = np.empty(len(rows)), np.empty(len(rows))
-
-        def run(H: _Array, d: _Array | None, R: _Array) -> _Modes:
-            offset = None if d is None else _looked_up(d, mode)
-            return np.array(
-                self._lanes.measure(rows, write, z, _looked_up(H, mode), offset, _looked_up(R, mode), d2, log_f)
-            )
-
-        fault = run(H, d, R)
+        fault = self._measure(rows, z, (H, d, R), mode, d2, log_f, write=write)
         if fault[0] == _DOUBTFUL:
-            fault = run(finite("H", H), None if d is None else finite("d", d), covariances("R", finite("R", R)))
+            model = finite("H", H), None if d is None else finite("d", d), covariances("R", finite("R", R))
+            fault = self._measure(rows, z, model, mode, d2, log_f, write=write)
         if fault[0] == _DOUBTFUL:
             raise ModelError("R is not positive semidefinite. Give covariances, never factors or precisions.")
         if fault[0]:
             raise _refused_row(fault, z)
         return d2, log_f
+
+    def _measure(
+        self,
+        rows: _Rows,
+        z: _Array,
+        model: tuple[_Array, _Array | None, _Array],
+        mode: _Modes | None,
+        d2: _Array,
+        log_f: _Array,
+        *,
+        write: bool,
+    ) -> _Modes:
+        """Write d2 and log f(z); return what is wrong, and where."""
+        H, d, R = model
+        offset = None if d is None else _looked_up(d, mode)
+        return np.array(
+            self._lanes.measure(rows, write, z, _looked_up(H, mode), offset, _looked_up(R, mode), d2, log_f)
+        )
 
     def moments(self, rows: _Rows) -> tuple[_Array, _Array, _Array]:
         """Return mean, covariance and mode probabilities of rows."""
