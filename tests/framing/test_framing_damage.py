@@ -119,6 +119,17 @@ def test_formats_joined():
         assert f"byte {len(parts[0][0])}: the recording goes on as packet capture" in told.problems[0]
 
 
+@pytest.mark.parametrize("second", ["pcap", "pcapng", "gps", "ioss", "rff"])
+@pytest.mark.parametrize("cut", [1, 3, 7, 20, 30])
+def test_a_cut_block_does_not_hide_the_beginning_of_another_format(second, cut):
+    made = {"pcap": lambda b: pcap(packets(b)), "pcapng": lambda b: pcapng(packets(b)), **CONTAINERS}[second]
+    first = plain(BODIES[:20])[:-cut]
+    got, told = frame(first + made(BODIES[:40]))
+    assert bodies(got) == BODIES[:19] + BODIES[:40]
+    assert [s.framing for s in told.segments] == ["plain", second]
+    assert told.problems
+
+
 def test_captures_joined_where_the_first_is_cut_off():
     first, second = pcap(packets(BODIES[:20])), pcap(packets(BODIES[20:40]), start=1_700_000_900)
     for lost in (1, 10, 60, 80):

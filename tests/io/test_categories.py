@@ -251,7 +251,7 @@ def test_what_has_no_table_is_refused_with_what_to_do(tmp_path):
     got = load(tmp_path, PLOT, *odd)
     (said,) = (p for p in got.problems if "category 62 is not read" in p)
     assert "30 blocks; none of the editions 1.16" in said
-    assert "Editions of CAT062 before 1.16 have no public table: have the centre send 1.16 or later." in said
+    assert "Of CAT062 there is no table of editions before 1.16: have the centre send a later one." in said
 
 
 def test_plots_and_tracks_of_an_old_radar_in_one_block(tmp_path):

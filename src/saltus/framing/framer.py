@@ -150,12 +150,15 @@ class Framer:
         if c.weak:
             astray = overlong(view, found, count, c, self._longest)
             if astray is None and not waits and found.position < n:
-                astray = lying(view, found, c, _BACK)
-        yield from self._emit(found, count if astray is None else astray[0], c)
+                astray = lying(view, found, c, _BACK, others=not self._asked)
+        yield from self._emit(found, count if astray is None else astray.block, c)
         if astray is not None:
-            self._place = int(found.offset[astray[0]])
-            yield from self._ended(view, astray[1])
-            self._place = self._keep = astray[1]
+            self._place = int(found.offset[astray.block])
+            yield from self._ended(view, astray.position)
+            self._place = self._keep = astray.position
+            if astray.framing:
+                self._begun = self._base + astray.position
+                self._begin(astray.framing, astray.position, astray.header)
             return
         self._place = self._keep = settled if waits else found.position
         if waits or found.position == n:

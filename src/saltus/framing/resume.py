@@ -11,7 +11,7 @@ from saltus.framing.guess import CHAIN, ENOUGH, Credible, begins_capture, sensib
 from saltus.framing.scan import HEADER, Known, Scan
 from saltus.framing.twins import Scanner
 
-__all__ = ["LOOK", "View", "admitted", "lying", "next_frame", "next_framing"]
+__all__ = ["LOOK", "Astray", "View", "admitted", "lying", "next_frame", "next_framing"]
 
 LOOK = 1 << 19  # bytes that must be at hand behind a place before it is judged, unless the recording ends
 _UNKNOWN, _RUN = 32, 1 << 18  # blocks, and bytes, of unassigned categories in a row
@@ -73,24 +73,37 @@ def _window(view: View, position: int) -> _Bytes:
     return view.data[position : position + LOOK]
 
 
-def lying(view: View, found: Scan, c: Container, back: int) -> tuple[int, int] | None:
-    """The block whose false length led astray to `found.position`: its number, and where the next one begins.
+class Astray(NamedTuple):
+    """A block that hides what begins within it."""
 
-    Looked for among the last blocks that follow no definition.
+    block: int  # its number
+    position: int  # where the next frame, or a recording of another framing, begins
+    framing: str = ""  # the other framing, and
+    header: int = 0  # the size of its file header
+
+
+def lying(view: View, found: Scan, c: Container, back: int, *, others: bool) -> Astray | None:
+    """The block whose false length led astray to `found.position`, and where the next one begins.
+
+    Looked for among the last blocks that follow no definition. One that its recording's end cuts off may also hide
+    where a recording of another framing begins, if `others` are wanted.
     """
     first = len(found.offset)
     lowest = max(0, first - back)
     while first > lowest and view.records(*_span(found, first - 1)) is not True:
         first -= 1
-    if first == len(found.offset):
-        return None
-    position = _within(view, int(found.offset[first]) + 1, found.position - 1, c)
-    return None if position < 0 else (int(np.searchsorted(found.offset, position)) - 1, position)
+    last, position = found.position - 1, -1
+    if first < len(found.offset):
+        position = _within(view, int(found.offset[first]) + 1, last, c)
+    if others and len(found.offset):  # few bytes of another header in a block's last item hurt no definition
+        start = int(found.offset[min(first, len(found.offset) - 1)]) + 1
+        other = next_framing(view, start, last, c.name)
+        if other is not None and (position < 0 or other[0] < position):
+            return Astray(int(np.searchsorted(found.offset, other[0])) - 1, *other)
+    return None if position < 0 else Astray(int(np.searchsorted(found.offset, position)) - 1, position)
 
 
-def overlong(
-    view: View, found: Scan, count: int, c: Container, longest: npt.NDArray[np.int32]
-) -> tuple[int, int] | None:
+def overlong(view: View, found: Scan, count: int, c: Container, longest: npt.NDArray[np.int32]) -> Astray | None:
     """The first block longer than all of its category before it that hides believable ones, and where these begin.
 
     A false length may lead to where another block begins, by accident, and nothing breaks.
@@ -112,7 +125,7 @@ def overlong(
         if view.records(start, stop) is not True:
             position = _within(view, start + 1, stop - 1, c)
             if position >= 0:
-                return k, position
+                return Astray(k, position)
         longest[found.category[k]] = stop - start
     return None
 
@@ -164,14 +177,17 @@ def next_framing(
 ) -> tuple[int, str, int] | None:
     """Where another framing than the current one begins, up to `last`: place, name, and size of its file header.
 
-    Where the last frame may only be cut `short`, a container must begin in its place.
+    Where the last frame may only be cut `short`, a container must begin in its place; with a file header,
+    also behind less than a block's header.
     """
     best: tuple[int, str, int] | None = None
     for c in CONTAINERS:
         if c.name != current:
-            place = _other(view, start, start if short else last if best is None else best[0] - 1, c)
-            if place >= 0:
-                header = c.file_header if place - c.file_header >= start else 0
+            behind = HEADER - 1 if c.file_header else 0
+            furthest = start + behind if short else last if best is None else best[0] - 1
+            place = _other(view, start, furthest + c.file_header, c)
+            header = c.file_header if place - c.file_header >= start else 0
+            if 0 <= place - header <= furthest:
                 best = place - header, c.name, header
     text = view.data[start : last + 12].tobytes()
     for magic in MAGIC:

@@ -21,11 +21,11 @@ _SURELY = 0.9  # an edition that explains as much is theirs, where the one asked
 _FOLLOWS, _LUCK = 0.97, 0.3  # blocks that follow their own edition, and another one
 _HURT = 0.9  # what a block counts whose records are all kept, one without its broken item
 _HEADER = 3  # bytes
-# What to do about categories and editions of which there is no table, besides the common advice.
+# What to do about categories and editions that the tables do not have, besides the common advice.
 _ASK = {
-    21: "Editions 1.x of CAT021 have no public table: have the station send 2.1 or later, or 0.23.",
-    30: "CAT030 is the former format of system tracks, without a public table: have the centre send CAT062.",
-    62: "Editions of CAT062 before 1.16 have no public table: have the centre send 1.16 or later.",
+    21: "Of CAT021 there is no table of editions 1.x: have the station send 2.1 or later.",
+    30: "CAT030 is the former format of system tracks: have the centre send CAT062.",
+    62: "Of CAT062 there is no table of editions before 1.16: have the centre send a later one.",
 }
 _COMMONEST = {21: "2.1"}  # what most stations send, taken among equals: later ones extend it
 
