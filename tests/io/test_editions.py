@@ -37,6 +37,8 @@ def test_one_record_tells_its_edition(tmp_path):
     assert np.degrees(got.plots.latitude[0]) == pytest.approx(-438260 * 180 / 2**23, abs=1e-9)
     assert np.degrees(got.plots.longitude[0]) == pytest.approx(2134282 * 180 / 2**23, abs=1e-9)
     assert got.plots.altitude[0] == pytest.approx(35000 * 0.3048)
+    assert got.plots.containment[0] == pytest.approx(185.2)  # PA 7 is a NUCp: a bound of 0.1 NM
+    assert np.isnan(got.plots.sigma[0])  # and no accuracy
     assert "edition guessed: 0.23 explains 100% of the bytes" in got.contents[0].notes[0]
 
 
