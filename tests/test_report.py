@@ -16,7 +16,7 @@ from saltus.geo import Site
 from saltus.records import REASONS, Kind, Plots, Source, System
 from saltus.report import colours, data, tables, write_report
 from saltus.report.sensors import HEIGHT, WIDTH
-from saltus.report.settings import UNITS
+from saltus.report.settings import UNITS, readable
 from saltus.report.updates import groups, read_updates
 from saltus.tracks.health import Degraded, Health
 from saltus.tracks.registration import RegistrationSettings
@@ -395,6 +395,12 @@ def test_any_summary_becomes_tables():
     assert mixed[1].rows == (("Probability", "0.999"), ("Keep", "yes"))
     assert tables.blocks("runs", [{"a": 1}, {"b": 2.0}])[0].rows == (("1", "–"), ("–", "2"))
     assert tables.blocks("n", 12_345)[0].rows == (("12\u202f345",),)
+
+
+def test_the_plane_is_said_in_short():
+    plane = {"projection": "stereographic, WGS-84, of scale 1", "latitude": 41.300699561, "longitude": 2.1}
+    said = readable({"plane": plane})["plane"]
+    assert said == {"projection": "stereographic", "centre_latitude_deg": 41.3007, "centre_longitude_deg": 2.1}
 
 
 def test_run_has_dates_and_units(tmp_path):

@@ -14,7 +14,7 @@ SECONDS = 100.0
 
 def radars_toml():
     """Return the configuration of the radars' sites; a minute is the first stretch."""
-    text = "[setup]\nseconds = 60.0\n"
+    text = "[setup]\nseconds = 60.0\nfewest = 1\n"
     for sic, site in enumerate(SITES, start=1):
         text += f"[[sensor]]\nsac = 1\nsic = {sic}\nheight = {site.height}\n"
         text += f"latitude = {np.degrees(site.latitude):.9f}\nlongitude = {np.degrees(site.longitude):.9f}\n"
@@ -32,7 +32,7 @@ def demo_start(folder, seed, share=0.5):
         files.append(folder / path.name)
         files[-1].write_bytes(content[:end])
     config = folder / "config.toml"
-    config.write_text(made.config.read_text() + "\n[setup]\nseconds = 60.0\n")
+    config.write_text(made.config.read_text() + "\n[setup]\nseconds = 60.0\nfewest = 1\n")
     return [*map(str, files)], config
 
 

@@ -93,14 +93,18 @@ def test_an_intake_restored_goes_on(rng):
 
 @pytest.mark.parametrize("chunk", [1, 777, 100_000])
 def test_the_first_stretch_ends_when_every_source_gave_enough(chunk):
-    """A gives twenty reports a second, B one: 60 s pass before B gave 500; alone, A's 500th ends it."""
-    a, b = np.arange(0.0, 120.0, 0.05), np.arange(0.1, 120.0, 1.0)
-    for time, source, length in (
-        (a, np.zeros(len(a), int), 500),
-        (np.concatenate([a, b]), np.repeat([0, 1], [len(a), len(b)]), 1201 + 60),
+    """A gives twenty reports a second, B one: 60 s end it, or six times that; alone, A's 500th does."""
+    a, b = np.arange(0.0, 420.0, 0.05), np.arange(0.1, 420.0, 1.0)
+    both = np.concatenate([a, b]), np.repeat([0, 1], [len(a), len(b)])
+    leap = np.where(both[0] > 20.0, 1e6, 0.0)  # a gap counts as a minute
+    for time, source, length, fewest in (
+        (a, np.zeros(len(a), int), 500, 1),
+        (*both, 1201 + 60, 60),
+        (*both, 7201 + 360, 61_000),
+        (both[0] + leap, both[1], 401 + 20 + 1, 20),
     ):
         order = np.argsort(time, kind="stable")
-        plots, taken, stretch = reports(time[order], source[order]), 0, Stretch(SetupSettings(500, 60.0))
+        plots, taken, stretch = reports(time[order], source[order]), 0, Stretch(SetupSettings(500, 60.0, fewest))
         for begin in range(0, len(plots), chunk):
             part = plots.take(slice(begin, begin + chunk))
             stop = stretch.add(part, np.arange(begin, begin + len(part)))

@@ -15,6 +15,10 @@ __all__ = ["Stretch"]
 _Index = npt.NDArray[np.int64]
 
 
+_GAP = 60.0  # s: longer without a report counts as so much
+_LONGEST = 6.0  # times as long as asked, where sources report seldom
+
+
 class Stretch:
     """Collects usable reports in order of time until there are enough."""
 
@@ -24,27 +28,31 @@ class Stretch:
         self._plots: list[Plots] = []
         self._number: list[_Index] = []
         self._count = np.zeros(0, np.int64)  # reports of each source
-        self._start = np.inf
+        self._last, self._heard = np.inf, 0.0  # s: time of the last report, and how long there were any
 
     def add(self, plots: Plots, number: _Index) -> int:
         """Take reports; return how many of them complete the stretch, one more than there are where none does.
 
-        The stretch is complete with the first report by which every source present gave enough, or time is up.
+        The stretch is complete with the first report by which every source present gave enough, or time is up
+        (`SetupSettings`).
         """
         if not len(plots):
             return 1
-        self._start = min(self._start, float(plots.time[0]))
+        settings = self._settings
+        gaps = np.diff(plots.time, prepend=min(self._last, float(plots.time[0])))
+        heard = np.cumsum(np.append(self._heard, np.minimum(gaps, _GAP)))[1:]  # one by one, whatever the pieces
         size = max(len(self._count), int(plots.source.max()) + 1)
         seen = np.zeros((len(plots), size), np.int64)
         seen[np.arange(len(plots)), plots.source] = 1
         count = np.cumsum(seen, axis=0) + np.pad(self._count, (0, size - len(self._count)))
-        each = ((count >= self._settings.reports) | (count == 0)).all(axis=1)
-        enough = each | (plots.time - self._start >= self._settings.seconds)
+        many, some = (((count >= n) | (count == 0)).all(axis=1) for n in (settings.reports, settings.fewest))
+        enough = many | (some & (heard >= settings.seconds)) | (heard >= _LONGEST * settings.seconds)
         stop = int(enough.argmax()) + 1 if enough.any() else len(plots) + 1
         taken = min(stop, len(plots))
         self._plots.append(plots.take(slice(0, taken)))
         self._number.append(number[:taken])
-        self._count = count[taken - 1]
+        self._count, self._heard = count[taken - 1], float(heard[taken - 1])
+        self._last = float(plots.time[taken - 1])
         return stop
 
     def collected(self) -> tuple[Plots, _Index] | None:

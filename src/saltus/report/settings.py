@@ -57,12 +57,17 @@ _TIMES = ("time_from", "time_to")
 
 
 def readable(summary: Mapping[str, object]) -> dict[str, object]:
-    """Return the summary with its times as UTC text and the unit of each setting in its name."""
+    """Return the summary with its times as UTC text, its plane in short and the unit of each setting in its name."""
     out = dict(summary)
     for name in _TIMES:
         seconds = out.get(name)
         if isinstance(seconds, int | float):
             out[name] = f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    plane = out.get("plane")
+    if isinstance(plane, Mapping):  # in short: the whole sentence would fill the page
+        out["plane"] = {"projection": str(plane["projection"]).split(",")[0]} | {
+            f"centre_{axis}_deg": round(float(plane[axis]), 5) for axis in ("latitude", "longitude")
+        }
     settings = out.get("settings")
     if isinstance(settings, Mapping):
         out["settings"] = {str(key): _with_units(str(key), part) for key, part in settings.items()}

@@ -262,20 +262,24 @@ class RegistrationSettings:
 class SetupSettings:
     """The first stretch of reports, from which noise, update periods and backgrounds are learnt.
 
-    It ends when every source present gave `reports` of them, or after `seconds`; then it is tracked, and until then
+    It ends when every source present gave `reports` of them, or after `seconds` if each gave `fewest`, and after six
+    times `seconds` at the latest. Of a gap in the data one minute counts. Then the stretch is tracked; until then
     nothing is published.
 
     Attributes:
         reports: of each source.
-        seconds: of data, at the longest.
+        seconds: of data.
+        fewest: reports of each source from which something can be learnt.
     """
 
     reports: int = 5_000
     seconds: float = 600.0
+    fewest: int = 500
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""
-        if not self.reports >= 1:
-            raise ModelError(f"setup.reports is a number of reports, 1 or more, got {self.reports}.")
+        for name in ("reports", "fewest"):
+            if not getattr(self, name) >= 1:
+                raise ModelError(f"setup.{name} is a number of reports, 1 or more, got {getattr(self, name)}.")
         if not 0.0 < self.seconds < np.inf:
             raise ModelError(f"setup.seconds must be positive and finite, got {self.seconds}.")
