@@ -376,6 +376,7 @@ def targets() -> dict[str, Target]:
         Target("ordered", ".pcap", (*captures, captures[0] + captures[1], *contained), _BYTES, _ordered),
         Target("converted", ".ast", (plain["cat048"], *_every_category()[:6]), _BYTES, _converted),
         Target("csv", ".csv", (_csv(table), _csv(table, "\r\n")), _CELLS, _record),
+        Target("rows", ".csv", (_csv(table), _csv(table, "\r\n")), _CELLS, _ordered),
         Target("parquet", ".parquet", parquet, _CELLS, _record),
         Target("truth", ".csv", (_csv(_TRUTH),), _CELLS, read_reference),
         Target("tracks", ".parquet", (_parquet(_TRACKS),), _CELLS, read_tracks),

@@ -120,7 +120,7 @@ def test_blocks_of_one_sensor_lag(tmp_path):
     tight = ReadingSettings(memory=1e6)  # 4000 reports may wait
     assert sum(len(c.plots) for c in read_in_order([path], settings=tight)) == 18_000
     together(path, 3000)
-    with pytest.raises(DataError, match=r"come 3000 s after those of others: \d+ reports wait"):
+    with pytest.raises(DataError, match=r"come 3000 s after others of a later time: \d+ reports wait"):
         list(read_in_order([path], settings=tight))
 
 

@@ -105,12 +105,12 @@ def read_in_order(
     settings: ReadingSettings | None = None,
     apart: Iterable[tuple[int, int]] = (),
 ) -> Iterator[Recording]:
-    """Read files and merge them by time as `read` does, a chunk at a time: memory does not grow with ASTERIX files.
+    """Read files and merge them by time as `read` does, a chunk at a time: memory does not grow with them.
 
     Clocks are judged as the reports come, and what was given is not taken back: where a clock is set back for good,
     its later reports are right as they are with `read`, but none of the earlier ones is marked for it. A recording
-    whose blocks are not in order of time is read from several places at once (`saltus.io.index`). Tables are held
-    whole.
+    whose blocks are not in order of time is read from several places at once (`saltus.io.index`). Rows of a table are
+    held as long as others of an earlier time may follow.
 
     Args:
         paths: as `read`, like all others.
@@ -134,9 +134,7 @@ def read_in_order(
         raise DataError("no input given: name at least one recording.")
     told = Told(date, editions or {}, framing, settings or ReadingSettings(), None, frozenset(apart))
     indexed = [
-        table_run(read_part(path, told, progress), k)
-        if "table" in format_of(path, framing).name
-        else asterix_runs(path, k, told, progress)
+        table_run(path, k) if "table" in format_of(path, framing).name else asterix_runs(path, k, told, progress)
         for k, path in enumerate(expand(paths))
     ]
     yield from InOrder(indexed, told.settings.memory)

@@ -14,13 +14,35 @@ from saltus.errors import DataError
 from saltus.io.sheet import is_text
 from saltus.text import brief, cut
 
-__all__ = ["Texts", "codes", "naive", "numbers", "refuse", "tell", "texts", "times", "truths"]
+__all__ = ["RowProblems", "Texts", "codes", "naive", "numbers", "refuse", "tell", "texts", "times", "truths"]
 
 _TRUTH = {"true": 1, "1": 1, "1.0": 1, "t": 1, "yes": 1, "false": 0, "0": 0, "0.0": 0, "f": 0, "no": 0}
 _DIGITS = {16: ("hexadecimal", re.compile("[0-9a-fA-F]{1,8}")), 8: ("octal", re.compile("[0-7]{1,6}"))}
 _NAN = (b"-1.#QNAN", b"-NaN", b"-nan", b"1.#QNAN", b"NaN", b"nan")  # no text either
 _TICKS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # a second's, by the unit of Arrow's time stamps
 _EPOCH = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+
+
+class RowProblems(list[str]):
+    """What is told of a table that is read in pieces: bad cells of one column and kind once, with their number.
+
+    `first_row` is the number of the piece's first row.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.first_row = 0
+        self._cells: dict[tuple[str, str, str], tuple[int, str, int]] = {}
+
+    def add(self, file: str, name: str, what: str, row: int, said: str, count: int) -> None:
+        """Count bad cells; the first of all is told."""
+        first, cell, before = self._cells.get((file, name, what), (row + self.first_row, said, 0))
+        self._cells[file, name, what] = first, cell, before + count
+
+    def texts(self) -> list[str]:
+        """All that is told."""
+        cells = [_bad_cells(file, name, what, *rest) for (file, name, what), rest in self._cells.items()]
+        return list(dict.fromkeys([*self, *cells]))
 
 
 class Texts(NamedTuple):
@@ -236,9 +258,16 @@ def tell(
     if bad:
         row, cell = bad[0]
         count = len(bad) if count is None else count
-        more = f", and in {count - 1} more rows" if count > 1 else ""
         said = brief(cell if isinstance(cell, bytes | str) else str(cell), 42)
-        problems.append(f"{path.name}: row {row}, column {brief(name)}: {said} is {what}{more}.")
+        if isinstance(problems, RowProblems):
+            problems.add(path.name, name, what, row, said, count)
+        else:
+            problems.append(_bad_cells(path.name, name, what, row, said, count))
+
+
+def _bad_cells(file: str, name: str, what: str, row: int, said: str, count: int) -> str:
+    more = f", and in {count - 1} more rows" if count > 1 else ""
+    return f"{file}: row {row}, column {brief(name)}: {said} is {what}{more}."
 
 
 def refuse(path: Path, problems: Sequence[str]) -> None:

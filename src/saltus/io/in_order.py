@@ -5,7 +5,7 @@
     recording.contents, problems, files      of everything, in the last chunk, which has no reports
 
 Every ASTERIX file is indexed first (`saltus.io.index`): its stretches in order of time are then read side by side, each
-from its place, and what lies in a stretch out of order is held as long as its lag asks for. A table is held whole.
+from its place, and what lies in a stretch out of order is held as long as its lag asks for; so are rows of tables.
 """
 
 import datetime
@@ -24,10 +24,11 @@ from saltus.io.clock import DAY, SORTING_WINDOW, ClockJudge, OrderFaults
 from saltus.io.contents import Tally
 from saltus.io.dating import Clock
 from saltus.io.index import TIMED, index_pieces
-from saltus.io.merge import completed, credible_times, mark_order, mark_values, next_day, shift, told_next_day
+from saltus.io.merge import LIMITS, completed, credible_times, mark_order, mark_values, next_day, shift, told_next_day
 from saltus.io.part import Part, printable
 from saltus.io.stream import Stream
 from saltus.io.stretches import Stretch, Stretches, order_words
+from saltus.io.table import read_table_pieces, times_of_rows
 from saltus.io.told import Progress, Told
 from saltus.records import REASONS, Contents, FileContents, Plots, Recording, System
 from saltus.text import shown
@@ -112,9 +113,18 @@ def asterix_runs(path: Path, number: int, told: Told, progress: Progress | None)
     return Indexed(path.name, span, not captured, runs, problems, file)
 
 
-def table_run(part: Part, number: int) -> Indexed:
-    """A table, whose rows may stand in any order."""
-    return Indexed(part.plots.files[0], (np.nan, np.nan), False, [Run(number, iter([part]), -np.inf, 0.0)])
+def table_run(path: Path, number: int) -> Indexed:
+    """Look through the times of a table, whose rows may stand in any order; its rows are read when they are wanted."""
+    start, newest, lag = np.inf, -np.inf, 0.0
+    low, high = LIMITS["time"]
+    for time in times_of_rows(path):
+        told = time[(time >= low) & (time <= high)]
+        if len(told):
+            before = np.maximum.accumulate(np.append(newest, told))[:-1]
+            lag = max(lag, float((before - told).max(initial=0.0, where=np.isfinite(before))))
+            start, newest = min(start, float(told.min())), max(newest, float(told.max()))
+    run = Run(number, read_table_pieces(path), start if np.isfinite(start) else -np.inf, lag)
+    return Indexed(path.name, (np.nan, np.nan), False, [run])
 
 
 def _day(time: float) -> datetime.date:
@@ -206,9 +216,10 @@ class InOrder:
         if n * PER_REPORT > self._memory:
             lag = max((r for r in self._runs if r.begun and not r.done), key=lambda r: r.lag)
             raise DataError(
-                f"{self._names[lag.file]}: blocks of some of its sources come {lag.lag:.0f} s after those of others: "
+                f"{self._names[lag.file]}: some of its reports come {lag.lag:.0f} s after others of a later time: "
                 f"{n} reports wait for them, about {n * PER_REPORT / 1e9:.3g} GB, and {self._memory / 1e9:.3g} GB are "
-                "allowed. Give more as memory (bytes) in the table [reading] of the configuration."
+                "allowed. Sort a table by time, or give more as memory (bytes) in the table [reading] of the "
+                "configuration."
             )
 
     def _release(self, horizon: float) -> list[Plots]:

@@ -5,7 +5,7 @@ a megabyte in a million rows takes a megabyte; `saltus.io.cells` reads it. Cells
 """
 
 import csv
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pyarrow import csv as arrow
     from pyarrow.parquet import ParquetFile
 
-__all__ = ["PER_ROW", "Sheet", "is_text", "read_sheet", "refuse_size"]
+__all__ = ["PER_ROW", "Sheet", "is_text", "read_sheet", "read_sheets", "refuse_size"]
 
 PER_ROW = 700.0  # bytes that a row takes as a report while files are read and merged, measured; see docs/formats.md
 _BLOCK = 1 << 22  # bytes; no row of a CSV table is longer
@@ -44,6 +44,7 @@ class Sheet:
     unused: dict[str, int]  # other columns -> cells that hold something
     broken: npt.NDArray[np.bool_]  # (n_rows,): rows of more or fewer cells than the header; all their cells are null
     problems: list[str] = field(default_factory=list)
+    first: int = 0  # number of its first row in the table, where it is a piece of one
 
 
 def read_sheet(path: Path, wanted: Collection[str] | None = None, settings: ReadingSettings | None = None) -> Sheet:
@@ -62,6 +63,20 @@ def read_sheet(path: Path, wanted: Collection[str] | None = None, settings: Read
     with path.open("rb") as file:
         parquet = file.read(4) == _PARQUET or path.suffix.lower() in _SUFFIXES
     return _read_parquet(path, wanted, memory) if parquet else _read_csv(path, wanted, memory)
+
+
+def read_sheets(path: Path, wanted: Collection[str]) -> Iterator[Sheet]:
+    """Read a table as `read_sheet` does, a piece of some ten thousand rows at a time.
+
+    Yields:
+        Pieces in the order of their rows; the last has no rows, and tells what was wrong with rows of all.
+
+    Raises:
+        DataError: as `read_sheet`.
+    """
+    with path.open("rb") as file:
+        parquet = file.read(4) == _PARQUET or path.suffix.lower() in _SUFFIXES
+    yield from _parquet_sheets(path, wanted) if parquet else _csv_sheets(path, wanted)
 
 
 def refuse_size(path: Path, needed: float, memory: float, what: str) -> None:
@@ -117,6 +132,36 @@ def _read_parquet(path: Path, wanted: Collection[str] | None, memory: float) -> 
     return Sheet(path, table.num_rows, columns, unused, np.zeros(table.num_rows, np.bool_))
 
 
+def _parquet_sheets(path: Path, wanted: Collection[str]) -> Iterator[Sheet]:
+    from pyarrow import parquet
+
+    first = 0
+    try:
+        with path.open("rb") as opened, parquet.ParquetFile(opened) as whole:
+            schema = whole.schema_arrow
+        names = [shown(name) for name in schema.names]
+        at = [schema.names[k] for k in _wanted(path, names, wanted)]
+        text = [field.name for field in schema if is_text(field.type)]
+        with path.open("rb") as opened, parquet.ParquetFile(opened, read_dictionary=text) as file:
+            flat = [f.name for f in schema if not pa.types.is_nested(f.type) and schema.names.count(f.name) == 1]
+            for batch in file.iter_batches(batch_size=_ROWS, columns=list(dict.fromkeys([*at, *flat]))):
+                n = batch.num_rows
+                unused = {name: n - batch[name].null_count for name in flat if name not in at}
+                unused |= {name: n for name in schema.names if name not in flat and name not in at}
+                table = pa.Table.from_batches([_sound(path, batch.select(at))])
+                columns = {shown(name): table[name] for name in at}
+                others = {shown(name): count for name, count in unused.items()}
+                yield Sheet(path, n, columns, others, np.zeros(n, np.bool_), first=first)
+                first += n
+    except UnicodeDecodeError as error:
+        named = brief(bytes(error.object))
+        raise DataError(f"{path}: the name of a column is no UTF-8 text: {named}; rename it.") from error
+    except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError, MemoryError) as error:
+        said = cut((str(error) or type(error).__name__).splitlines()[0], 200)
+        raise DataError(f"{path}: no readable Parquet table: {said}") from error
+    yield Sheet(path, 0, {}, {}, np.zeros(0, np.bool_), first=first)
+
+
 def _unpacked(path: Path, file: "ParquetFile", names: list[str], memory: float) -> tuple[pa.Table, dict[str, int]]:
     """Read columns batch by batch, and stop when they outgrow the memory.
 
@@ -163,21 +208,59 @@ def _read_csv(path: Path, wanted: Collection[str] | None, memory: float) -> Shee
     try:
         table = _cells_of(path, len(names), wrong, memory)
     except (pa.ArrowException, OSError, ValueError) as error:
-        said = cut(str(error).splitlines()[0], 200)
-        if "straddling" in said:
-            said = f"a row is longer than {_BLOCK} bytes; is a quote never closed?"
-        raise DataError(f"{path}: no readable CSV table: {said}") from error
+        raise _no_csv(path, error) from error
     n_rows = table.num_rows + len(wrong)
     broken = np.zeros(n_rows, np.bool_)
     broken[[row for row, _ in wrong]] = True
     problems = _told_broken(path, wrong, n_rows, len(names))
-    columns = [_as_lies(column) for column in table.columns]
-    if wrong:
+    kept, unused = _kept(names, at, table.columns, broken)
+    return Sheet(path, n_rows, kept, unused, broken, problems)
+
+
+def _kept(
+    names: Sequence[str], at: Sequence[int], cells: Sequence[pa.ChunkedArray], broken: npt.NDArray[np.bool_]
+) -> tuple[dict[str, pa.ChunkedArray], dict[str, int]]:
+    """Columns with the rows of another width as nulls: those wanted, and how much the others hold."""
+    columns = [_as_lies(column) for column in cells]
+    if broken.any():
         row = np.cumsum(~broken) - 1
         columns = [column.take(pa.array(row, pa.int64(), mask=broken)) for column in columns]
     kept = {names[k]: columns[k] for k in at}
-    unused = {name: len(c) - c.null_count for name, c in zip(names, columns, strict=True) if name not in kept}
-    return Sheet(path, n_rows, kept, unused, broken, problems)
+    return kept, {name: len(c) - c.null_count for name, c in zip(names, columns, strict=True) if name not in kept}
+
+
+def _no_csv(path: Path, error: Exception) -> DataError:
+    said = cut(str(error).splitlines()[0], 200)
+    if "straddling" in said:
+        said = f"a row is longer than {_BLOCK} bytes; is a quote never closed?"
+    return DataError(f"{path}: no readable CSV table: {said}")
+
+
+def _csv_sheets(path: Path, wanted: Collection[str]) -> Iterator[Sheet]:
+    names = _header(path)
+    at = _wanted(path, names, wanted)
+    wrong: list[tuple[int, int]] = []  # row, cells: of all pieces so far, and of what is read ahead
+    first = placed = 0
+    try:
+        for table in _cell_tables(path, len(names), wrong):
+            stop = first + table.num_rows
+            begin = placed
+            while placed < len(wrong) and wrong[placed][0] < stop:
+                stop, placed = stop + 1, placed + 1
+            broken = np.zeros(stop - first, np.bool_)
+            broken[[row - first for row, _ in wrong[begin:placed]]] = True
+            if len(broken):
+                kept, unused = _kept(names, at, table.columns, broken)
+                yield Sheet(path, len(broken), kept, unused, broken, first=first)
+            first = stop
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise _no_csv(path, error) from error
+    rest = len(wrong) - placed
+    if rest:
+        nulls = pa.chunked_array([pa.nulls(rest, pa.string())])
+        yield Sheet(path, rest, {names[k]: nulls for k in at}, {}, np.ones(rest, np.bool_), first=first)
+    problems = _told_broken(path, wrong, first + rest, len(names))
+    yield Sheet(path, 0, {}, {}, np.zeros(0, np.bool_), problems, first + rest)
 
 
 def _header(path: Path) -> list[str]:
@@ -208,7 +291,18 @@ def _header(path: Path) -> list[str]:
 
 
 def _cells_of(path: Path, width: int, wrong: list[tuple[int, int]], memory: float) -> pa.Table:
-    """Read the cells as text, the rows of another width noted, not returned; columns are numbered.
+    """Read the cells as text, the rows of another width noted, not returned; columns are numbered."""
+    tables = []
+    rows = size = 0
+    for table in _cell_tables(path, width, wrong):
+        rows, size = rows + table.num_rows, size + table.nbytes
+        tables.append(table)
+        refuse_size(path, (rows + len(wrong)) * PER_ROW + size, memory, f"more than {rows} rows")
+    return pa.concat_tables(tables)
+
+
+def _cell_tables(path: Path, width: int, wrong: list[tuple[int, int]]) -> Iterator[pa.Table]:
+    """Read the cells as text, some megabytes at a time, without the header.
 
     Bytes are taken for Latin-1, in which every byte is a character: what is no UTF-8 costs its cell alone.
     """
@@ -220,8 +314,6 @@ def _cells_of(path: Path, width: int, wrong: list[tuple[int, int]], memory: floa
         wrong.append((row.number - 2, row.actual_columns))  # it counts from 1, and the header
         return "skip"
 
-    batches = []
-    rows = size = 0
     with (
         path.open("rb") as opened,
         arrow.open_csv(
@@ -237,14 +329,13 @@ def _cells_of(path: Path, width: int, wrong: list[tuple[int, int]], memory: floa
             ),
         ) as reader,
     ):
+        header = 1
         for batch in reader:
-            rows, size = rows + batch.num_rows, size + batch.nbytes
-            batches.append(batch)
-            refuse_size(path, (rows + len(wrong)) * PER_ROW + size, memory, f"more than {rows} rows")
-    table = pa.Table.from_batches(batches)
-    if wrong[:1] and wrong[0][0] < 0:
-        raise DataError(f"{path}: no readable CSV table: its header is not one row of cells.")
-    return table.slice(1)
+            if wrong[:1] and wrong[0][0] < 0:
+                raise DataError(f"{path}: no readable CSV table: its header is not one row of cells.")
+            table = pa.Table.from_batches([batch]).slice(header)
+            header = max(header - batch.num_rows, 0)
+            yield table
 
 
 def _told_broken(path: Path, wrong: list[tuple[int, int]], n_rows: int, width: int) -> list[str]:

@@ -26,7 +26,9 @@ cannot be, is kept as a report with its reason; a code or text that cannot be re
 without the header.
 """
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,16 +36,16 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from saltus.errors import DataError
-from saltus.io.cells import codes, naive, numbers, tell, texts, times, truths
+from saltus.io.cells import RowProblems, codes, naive, numbers, tell, texts, times, truths
 from saltus.io.observer import FRAME, observer_columns
 from saltus.io.part import Part, revisit, rotating, scan_period
 from saltus.io.settings import ReadingSettings
-from saltus.io.sheet import Sheet, read_sheet
+from saltus.io.sheet import Sheet, read_sheet, read_sheets
 from saltus.io.units import check_units, doubts, meaning, tell_impossible, told_unused
 from saltus.records import REASONS, Contents, Kind, Plots, Source, System, Traits
 from saltus.text import cut, shown
 
-__all__ = ["read_table"]
+__all__ = ["read_table", "read_table_pieces", "times_of_rows"]
 
 _ALIASES = {"lat": "latitude", "lon": "longitude", "onground": "on_ground"}
 _DEGREE = np.pi / 180
@@ -88,23 +90,99 @@ def read_table(path: Path, settings: ReadingSettings | None = None) -> Part:
     if not sheet.n_rows:
         raise DataError(f"{path}: row 0: the table has columns and no row.")
     problems = [*sheet.problems, *told_unused(path.name, unused, _COLUMNS)]
+    columns, names = _columns(sheet, table, problems, judged=True)
+    return _part(path, table, names, columns, naive(table["time"]), problems)
+
+
+def read_table_pieces(path: Path) -> Iterator[Part]:
+    """Read a table as `read_table` does, a piece at a time: memory does not grow with it.
+
+    Units are judged by the first piece, and which source tells ranges by each.
+
+    Yields:
+        Pieces with rows, and last a part without: what was wrong with cells and rows of all.
+
+    Raises:
+        DataError: as `read_table`.
+    """
+    problems, unused = RowProblems(), Counter[str]()
+    n_naive = n_rows = 0
+    before: str | None = None
+    sources: dict[str, Contents] = {}
+    for sheet in read_sheets(path, (*_COLUMNS, *_ALIASES)):
+        problems += sheet.problems
+        if not sheet.n_rows:
+            continue
+        table, others = _named(sheet)
+        unused.update(others)
+        if not n_rows:
+            _need_columns(path, [*table, *others])
+        problems.first_row, n_rows = sheet.first, n_rows + sheet.n_rows
+        columns, names = _columns(sheet, table, problems, judged=sheet.first == 0, before=before)
+        before = names[int(np.asarray(columns["source"])[-1])]
+        n_naive += naive(table["time"])
+        part = _part(path, table, names, columns, 0, [])
+        sources |= {str(line.system): line for line in part.contents}
+        yield part
+    if not n_rows:
+        raise DataError(f"{path}: row 0: the table has columns and no row.")
+    lines = tuple(_silent(line, n_naive) for line in sources.values()) if n_naive else ()
+    told = (*told_unused(path.name, unused, _COLUMNS), *problems.texts())
+    yield Part(Plots.build(0, (), (path.name,), {}), None, lines, told, in_order=False, dated=True)
+
+
+def times_of_rows(path: Path) -> Iterator[npt.NDArray[np.float64]]:
+    """Times of the rows of a table, s, UTC, a piece at a time; NaN where a row tells none."""
+    for sheet in read_sheets(path, ("time",)):
+        if "time" in sheet.columns:
+            yield times(path, sheet.columns["time"], [])
+
+
+def _silent(line: Contents, n_naive: int) -> Contents:
+    """A line that adds a note and nothing else."""
+    nan = float("nan")
+    notes = _naive_notes(n_naive)
+    empty: dict[str, int] = {}
+    return replace(
+        line,
+        n_records=0,
+        n_reports=0,
+        time_from=nan,
+        time_to=nan,
+        update_period=nan,
+        fields=empty,
+        n_by_type=empty,
+        notes=notes,
+    )
+
+
+def _columns(
+    sheet: Sheet, table: _Columns, problems: list[str], *, judged: bool, before: str | None = None
+) -> tuple[dict[str, npt.ArrayLike], list[str]]:
+    """Columns of `Plots`, and the names of the sources; whether units can be right is judged if wanted.
+
+    `before` is the source of the row before the first.
+    """
+    path = sheet.path
     columns: dict[str, npt.ArrayLike] = {"time": times(path, table["time"], problems)}
     for name, (target, factor) in _NUMBERS.items():
         if name in table:
             columns[target] = numbers(path, name, table[name], problems) * factor
     columns |= _identity(path, table, problems)
-    names, source = _sources(path, table, sheet.broken, problems)
+    names, source = _sources(path, table, sheet.broken, problems, before)
     columns["kind"] = _kinds(columns, list(table))
     stated = _stated_kinds(path, table, sheet.n_rows, problems)
     if "range_m" in table:
         columns["kind"] = _lost_ranges(path, table, columns, source, stated != Kind.NONE, problems)
     columns["kind"] = np.where(stated == Kind.NONE, columns["kind"], stated)
-    check_units(path, _NUMBERS, columns)
+    if judged:
+        check_units(path, _NUMBERS, columns)
     tell_impossible(path, _NUMBERS, columns, problems)
-    problems += doubts(path.name, _NUMBERS, columns)
+    if judged:
+        problems += doubts(path.name, _NUMBERS, columns)
     reason = np.where(sheet.broken, REASONS.index("broken row"), 0)
-    columns = {**observer_columns(path, columns), "record": np.arange(sheet.n_rows), "reason": reason, "source": source}
-    return _part(path, table, names, columns, naive(table["time"]), problems)
+    record = sheet.first + np.arange(sheet.n_rows)
+    return {**observer_columns(path, columns), "record": record, "reason": reason, "source": source}, names
 
 
 def _named(sheet: Sheet) -> tuple[_Columns, dict[str, int]]:
@@ -148,9 +226,16 @@ def _identity(path: Path, table: _Columns, problems: list[str]) -> dict[str, npt
 
 
 def _sources(
-    path: Path, table: _Columns, broken: npt.NDArray[np.bool_], problems: list[str]
+    path: Path, table: _Columns, broken: npt.NDArray[np.bool_], problems: list[str], before: str | None = None
 ) -> tuple[list[str], npt.NDArray[np.int64]]:
     """Names of the sources in order, and which each row is of; a broken row is of that of the row before.
+
+    Args:
+        path: the table.
+        table: its columns.
+        broken: which rows are.
+        problems: what is told.
+        before: the source of the row before the first, where there is one.
 
     Raises:
         DataError: they are too many to be sensors.
@@ -159,8 +244,11 @@ def _sources(
         return [path.stem], np.zeros(len(broken), np.int64)
     found = texts(path, "source", table["source"], problems)
     whole = np.flatnonzero(~broken)
-    index = found.which[whole[np.maximum(np.cumsum(~broken) - 1, 0)]]
-    labels = np.array([*map(shown, found.values), path.stem], object)
+    place = np.cumsum(~broken) - 1
+    index = found.which[whole[np.maximum(place, 0)]] if len(whole) else np.full(len(broken), -1)
+    if before is not None:
+        index[place < 0] = len(found.values)
+    labels = np.array([*map(shown, found.values), path.stem if before is None else before, path.stem], object)
     here = np.unique(index)
     names = sorted(set(labels[here].tolist()))
     if len(names) > _MOST_SOURCES:
@@ -236,12 +324,16 @@ def _part(
         for name, at in zip(names, own, strict=True)
     )
     plots = Plots.build(n, sources, (path.name,), columns | {"file": np.zeros(n)})
-    notes = (f"{n_naive} times without an offset are taken as UTC",) if n_naive else ()
+    notes = _naive_notes(n_naive)
     contents = tuple(
         _contents(path, s.system, plots.take(at), {name: int(v[at].sum()) for name, v in given.items()}, notes)
         for s, at in zip(sources, own, strict=True)
     )
     return Part(plots, None, contents, tuple(problems), in_order=False, dated=True)
+
+
+def _naive_notes(n_naive: int) -> tuple[str, ...]:
+    return (f"{n_naive} times without an offset are taken as UTC",) if n_naive else ()
 
 
 def _contents(path: Path, system: System, own: Plots, fields: dict[str, int], notes: tuple[str, ...]) -> Contents:
