@@ -132,3 +132,7 @@ def test_a_configuration_tells_them_apart_without_being_asked(tmp_path):
     sites = [config.site_for(s.system) for s in got.plots.sources]
     assert [s.longitude for s in sites] == [1, 2]
     assert config.site_for(read([path]).plots.sources[0].system) is None
+    longer = recording(tmp_path / "b.raw")
+    for found in (read([longer], apart=config.apart), list(read_in_order([longer], apart=config.apart))[-1]):
+        assert not any("SAC/SIC" in p for p in found.problems)  # what to do has been done
+        assert {c.system.channel for c in found.contents} == {"board 1 line 1", "board 1 line 2"}

@@ -63,7 +63,7 @@ def read_asterix(
         DataError: the file is empty, holds no record, or too many reports, or an edition does not exist or is plainly
             not the file's.
     """
-    stream = Stream(path, editions, framing, apart=apart)
+    stream = Stream(path, editions, framing, named=apart)
     parts: list[Part] = []
     n = 0
     for part in pieces_of(stream, date, most=most, progress=progress):
@@ -71,7 +71,7 @@ def read_asterix(
         refuse_size(path, n * PER_REPORT, memory, f"more than {n} reports")
         parts.append(part)
     if stream.changed or stream.found_apart:  # now that all is known of its editions and sources
-        again = Stream(path, editions, framing, stream.chosen, stream.apart | stream.found_apart)
+        again = Stream(path, editions, framing, stream.chosen, stream.found_apart, stream.named)
         parts = list(pieces_of(again, date, most=most, progress=progress))
     return join_parts(parts)
 
@@ -100,8 +100,9 @@ def read_pieces(
     Yields:
         Pieces with records, and last a part without reports: what could not be read, and how the file is framed.
     """
-    found = channels_apart(Stream(path, editions, framing, apart=apart), date)
-    return pieces_of(Stream(path, editions, framing, apart=found), date, most=most, progress=progress)
+    named = frozenset(apart)
+    found = channels_apart(Stream(path, editions, framing, named=named), date)
+    return pieces_of(Stream(path, editions, framing, None, found, named), date, most=most, progress=progress)
 
 
 def channels_apart(stream: Stream, date: datetime.date | None) -> frozenset[tuple[int, int]]:
@@ -169,7 +170,7 @@ def pieces_of(
         raise DataError(f"{path}: no ASTERIX record could be read: wrong format, category or edition?{said}")
     lines = tuple(_unread(name, number, note) for number, note in unread.items())
     problems += clock.problems
-    problems += assembler.same_code.problems(name, stream.channels, stream.apart)
+    problems += assembler.same_code.problems(name, stream.channels, stream.apart, stream.named)
     stream.found_apart = assembler.same_code.apart() - stream.apart
     file = replace(about_file(path, stream.told, most), order=order_words(order.finish()))
     yield Part(Plots.build(0, (), (name,), {}), None, lines, tuple(problems), True, clock.captured, file)

@@ -86,10 +86,10 @@ def asterix_runs(path: Path, number: int, told: Told, progress: Progress | None)
     captured = clock.captured and not clock.dateless
     apart = told.apart
     if len(stream.channels) > 1:
-        apart = channels_apart(Stream(path, told.editions, told.framing, stream.chosen, apart), told.date)
+        apart = channels_apart(Stream(path, told.editions, told.framing, stream.chosen, (), apart), told.date)
 
     def stream_again() -> Stream:
-        return Stream(path, told.editions, told.framing, stream.chosen, apart)
+        return Stream(path, told.editions, told.framing, stream.chosen, apart, told.apart)
 
     if len(found) < 2:
         start, lag = (found[0].time_from, found[0].lag) if found else (-np.inf, 0.0)

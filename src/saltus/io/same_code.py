@@ -5,7 +5,7 @@ the next; antennas that turn side by side pass north at times of two rhythms. Wh
 the channels are the sensors.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -105,18 +105,25 @@ class SameCode:
         """SAC and SIC of the codes whose channels are sensors of their own."""
         return frozenset(code for code, e in self._evidence.items() if e.two() and e.by_channel())
 
-    def problems(self, name: str, channels: Sequence[str], kept: Iterable[tuple[int, int]]) -> list[str]:
+    def problems(
+        self,
+        name: str,
+        channels: Sequence[str],
+        kept: Collection[tuple[int, int]],
+        named: Collection[tuple[int, int]] = (),
+    ) -> list[str]:
         """What is told of the codes that two sensors send.
 
         Args:
             name: of the recording.
             channels: names of the channels.
             kept: codes whose channels were kept apart.
+            named: of these, those that a configuration names: nothing is told of them where channels are sensors.
         """
         return [
             _told(name, code, e, [channels[c] for c in sorted(e.channels) if c >= 0], apart=code in kept)
             for code, e in self._evidence.items()
-            if e.two()
+            if e.two() and not (code in named and e.by_channel())
         ]
 
 

@@ -29,6 +29,7 @@ class Stream:
         framing: str | None = None,
         chosen: Mapping[int, Chosen] | None = None,
         apart: Iterable[tuple[int, int]] = (),
+        named: Iterable[tuple[int, int]] = (),
     ) -> None:
         """Begin a file.
 
@@ -38,6 +39,7 @@ class Stream:
             framing: one of `saltus.framing.NAMES`; None has it guessed.
             chosen: guesses that stand, of an earlier reading.
             apart: SAC and SIC of sources that an earlier reading has found to be several, one on each channel.
+            named: SAC and SIC of sources that a configuration tells apart by channel.
         """
         self.path = path
         self.chosen: dict[int, Chosen] = dict(chosen or {})
@@ -48,7 +50,8 @@ class Stream:
         self._sample: dict[int, Blocks] = {}
         self._framer = Framer(path.name, credible, framing=framing)
         self.told = self._framer.told
-        self.apart: frozenset[tuple[int, int]] = frozenset(apart)
+        self.named: frozenset[tuple[int, int]] = frozenset(named)
+        self.apart: frozenset[tuple[int, int]] = self.named.union(apart)
         self.found_apart: frozenset[tuple[int, int]] = frozenset()  # others that turned out to be several
 
     @property
