@@ -163,3 +163,29 @@ def test_a_block_without_a_record_that_is_understood_has_no_time(tmp_path):
     (tmp_path / "b.csv").write_text("time,latitude,longitude\n1,2,3\n")
     with pytest.raises(DataError, match="no input given"):
         next(read_in_order([]))
+
+
+RECORDED = (
+    "lebl_2016-05-10/smr.ast",
+    "lebl_2016-05-10/mlat.ast",
+    "bcn_cat048_2023-05-02/bcn_cat048.ast",
+    "argentina_2026-04-29/radar_226_232.pcap",
+    "argentina_2026-04-29/cat062_226_2.pcap",
+    "asterix_small/adsb_v21_bcn.ast",
+    "asterix_small/spain_multiradar_8s.gps",
+    "asterix_small/croatia_cat034_048.pcap",
+)
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_recordings_of_real_sensors(recordings, name):
+    path = recordings / name
+    whole = read([path])
+    *chunks, last = read_in_order([path])
+    reasons = np.concatenate([c.plots.reason for c in chunks])
+    assert np.bincount(reasons).tolist() == np.bincount(whole.plots.reason).tolist()
+    time = np.concatenate([c.plots.time[c.plots.reason == 0] for c in chunks])
+    np.testing.assert_array_equal(time, whole.plots.time[whole.plots.reason == 0])
+    assert sorted(last.problems) == sorted(whole.problems)
+    tracks = [c.tracks.num_rows for c in chunks if c.tracks is not None]
+    assert sum(tracks) == (0 if whole.tracks is None else whole.tracks.num_rows)
