@@ -243,11 +243,11 @@ inline void merge_copies(const Tracks& from, const std::int64_t* start, const do
               continue;
             }
             for (int i = 0; i < n; ++i) {
-              const double away = element(from, c0 + l, state + i) - merged[i];
+              const double part = w / total, away = element(from, c0 + l, state + i) - merged[i];
               for (int k = 0; k <= i; ++k) {
                 const int at = n + packed(i, k);
-                merged[at] += w / total * (element(from, c0 + l, state + at) +
-                                           away * (element(from, c0 + l, state + k) - merged[k]));
+                merged[at] += part * element(from, c0 + l, state + at) +
+                              part * away * (element(from, c0 + l, state + k) - merged[k]);  // no square overflows
               }
             }
           }

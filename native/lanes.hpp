@@ -32,6 +32,8 @@ SALTUS_INLINE V select(I mask, V yes, V no) { return mask ? yes : no; }
 SALTUS_INLINE V minimum(V a, V b) { return a < b ? a : b; }
 SALTUS_INLINE V maximum(V a, V b) { return a > b ? a : b; }
 
+SALTUS_INLINE V magnitude(V a) { return reinterpret_cast<V>(reinterpret_cast<I>(a) & 0x7fffffffffffffffLL); }
+
 SALTUS_INLINE bool any(I mask) {
 #if defined(__AVX512F__)
   return __builtin_ia32_ptestmq512(mask, mask, -1) != 0;

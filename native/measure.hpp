@@ -6,9 +6,6 @@
 
 namespace saltus::SALTUS_NS {
 
-// Share of S_aa below which the innovation variance of component a, given those before it, is the square of rounding.
-inline constexpr double kEmpty = 0x1p-98;
-
 // Whether an innovation variance s, of `whole` before those before it, is more than rounding.
 SALTUS_INLINE I certain(V s, V whole) { return s > maximum(kEmpty * whole, splat(kNothing)); }
 SALTUS_INLINE bool certain(double s, double whole) { return s > kEmpty * whole && s > kNothing; }
@@ -106,13 +103,30 @@ SALTUS_INLINE I sweep(int n, int m, int wide, Deviations<N, M>& by, const V* on,
   return bad;
 }
 
+// What is known exactly has no variance: what rounding left of P would be believed by the next exact measurement.
+template <int N, int M, int WIDE>
+SALTUS_INLINE void forget_rounding(int n, int wide, Deviations<N, M>& by, const V* P) {
+  each<N>(n, [&](int i) SALTUS_LAMBDA {
+    V left{};
+    each<WIDE>(wide, [&](int k) SALTUS_LAMBDA { left += by.x[i * wide + k] * by.weight[k] * by.x[i * wide + k]; });
+    const V keep = select(left <= kEmpty * P[packed(i, i)], V{}, splat(1.0));
+    each<WIDE>(wide, [&](int k) SALTUS_LAMBDA { by.x[i * wide + k] *= keep; });
+  });
+}
+
 // Innovation and sweep and, if `write`, the squares of what is left.
 template <int N, int M, int WIDE, bool Own, class E>
 SALTUS_INLINE I conditioned_known(int n, int m, int wide, Deviations<N, M>& by, const V* on, V* state, V* report,
                                   const E* Q, int stride, V* heap, bool write) {
   innovation<N, M, WIDE, Own>(n, m, wide, by, on, report);
   const I bad = sweep<N, M, WIDE, Own>(n, m, wide, by, on, state, report, write);
-  if (write) squares_known<N, WIDE>(n, wide, &by.x[0], &by.weight[0], Q, stride, state + n, heap);
+  if (!write) return bad;
+  if constexpr (Own) {
+    I exact{};
+    each<M>(m, [&](int a) SALTUS_LAMBDA { exact |= by.weight[n + a] <= kEmpty * report[2 + 2 * m + packed(a, a)]; });
+    if (any(exact)) forget_rounding<N, M, WIDE>(n, wide, by, state + n);
+  }
+  squares_known<N, WIDE>(n, wide, &by.x[0], &by.weight[0], Q, stride, state + n, heap);
   return bad;
 }
 

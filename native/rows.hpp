@@ -82,6 +82,8 @@ inline void load_model(const Model& model, Size first, Size n_tracks, Size step,
 
 // Part of a variance by which a pivot may be negative before the matrix is no covariance.
 inline constexpr double kIndefinite = 1e-8;
+// Part of it below which a pivot is not divided by, or rounding would grow to that. Twins of filters/align.py.
+inline constexpr double kDead = 1e-6;
 
 // Lanes in which a full matrix of order n is no covariance, by its pivots; `rest` holds n^2 numbers.
 inline I indefinite(const V* a, int n, V* rest) {
@@ -89,13 +91,14 @@ inline I indefinite(const V* a, int n, V* rest) {
   for (int i = 0; i < n * n; ++i) rest[i] = a[i];
   for (int j = 0; j < n; ++j) {
     const V pivot = rest[j * n + j], least = kIndefinite * a[j * n + j];
-    const I dead = pivot <= least;
+    const I dead = pivot <= kDead * a[j * n + j];
     bad |= (pivot < -least) | (a[j * n + j] < 0.0);
     const V one_over = select(dead, V{}, reciprocal(pivot));
     for (int i = j + 1; i < n; ++i) {
       bad |= a[i * n + j] != a[j * n + i];
       const V column = rest[i * n + j], share = column * one_over;
-      bad |= dead & (column * column > kIndefinite * (a[j * n + j] * a[i * n + i]));
+      const V other = maximum(rest[i * n + i], V{}) + kIndefinite * a[i * n + i];
+      bad |= dead & (column * column > 4.0 * (maximum(pivot, V{}) + least) * other);
       for (int k = j + 1; k <= i; ++k) rest[i * n + k] -= share * rest[k * n + j];
     }
   }

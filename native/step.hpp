@@ -16,6 +16,12 @@ namespace saltus::SALTUS_NS {
 // Share of a variance that is rounding, for each of the subtractions it went through.
 inline constexpr double kRounding = 0x1p-51;
 
+// Share of two means by which rounding alone may part them.
+inline constexpr double kBlur = 0x1p-50;
+
+// Share of a variance below which what a measurement left of it, or of its own, is the square of rounding.
+inline constexpr double kEmpty = 0x1p-98;
+
 // A variance below it is none: its reciprocal would overflow. Twin of linalg.NOTHING.
 inline constexpr double kNothing = 0x1p-1000;
 
@@ -155,6 +161,12 @@ SALTUS_INLINE void pair_weights(V& a, V& b, const E* trans, V (&mu)[4]) {
   mu[0] = x0 * first, mu[1] = x1 * second, mu[2] = y0 * first, mu[3] = y1 * second;
 }
 
+// How far two means are apart: not at all, where rounding may have parted them, for the square of that is no variance.
+SALTUS_INLINE V apart(V a, V b) {
+  const V gap = a - b;
+  return select(magnitude(gap) > kBlur * magnitude(a), gap, V{});
+}
+
 // Moment matching of two modes, in place: R_j = mu_0j P_0 + mu_1j P_1 + mu_0j mu_1j (x_0 - x_1)(x_0 - x_1)'.
 template <int N>
 SALTUS_INLINE void mix_pair(V* a, V* b, const V (&mu)[4], int n, V* heap) {
@@ -162,7 +174,7 @@ SALTUS_INLINE void mix_pair(V* a, V* b, const V (&mu)[4], int n, V* heap) {
   Local<N> gap(heap, n);
   each<N>(n, [&](int i) SALTUS_LAMBDA {
     const V x = a[i], y = b[i];
-    gap[i] = x - y;
+    gap[i] = apart(x, y);
     a[i] = a0 * x + b0 * y;
     b[i] = a1 * x + b1 * y;
   });
@@ -195,7 +207,7 @@ SALTUS_INLINE void mix_fibre(V* first, long stride, int size, const V* mu, int n
     for (int i = 0; i < size; ++i) {
       const V weight = mu[i * size + j];
       const V* source = old + i * record;
-      each<N>(n, [&](int k) SALTUS_LAMBDA { gap[k] = source[k] - x[k]; });
+      each<N>(n, [&](int k) SALTUS_LAMBDA { gap[k] = apart(source[k], x[k]); });
       each<N>(n, [&](int k) SALTUS_LAMBDA {
         const V scaled = weight * gap[k];
         upto<N>(k, [&](int l) SALTUS_LAMBDA {

@@ -137,3 +137,71 @@ def coloured_problems(draw):
     n, m, n_steps = draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 7))
     missing = draw(st.sampled_from([0.0, 0.2, 0.7]))
     return random_coloured(rng, sizes, n, m, n_steps, batch, missing, draw(st.booleans()))
+
+
+def spread_cov(rng, lead, n, full=0.5):
+    """Covariances of any rank, in units of their own variances: half of them, by `full`, of full rank."""
+    root = rng.normal(size=(*lead, n, n))
+    rank = np.where(rng.random(lead) < full, n, rng.integers(0, n + 1, size=lead))
+    root = root * (np.arange(n) < rank[..., None])[..., None, :]
+    cov = root @ root.swapaxes(-1, -2)
+    return 0.5 * (cov + cov.swapaxes(-1, -2))
+
+
+def hostile_problem(rng, runs, sizes, n, m, n_steps, decades=8.0, farthest=150.0, noisy=False):
+    """Arguments of `imm_filter` for runs of all kinds, each with its own model: what double precision has to bear.
+
+    Standard deviations of the prior, of the process and of the measurements' noise differ by up to 10^`decades` either
+    way; covariances of any rank, none included; components without noise, measurements of one thing, more of them than
+    states; a tenth of the measurements is up to 10^`farthest` times too large, a tenth is missing. `noisy`: every
+    component has noise of its own, so that what is measured twice cannot contradict itself.
+    """
+    modes = (1,) * len(sizes)
+
+    def ten(low, high, *shape):
+        return 10.0 ** rng.uniform(low, high, size=(runs, *shape))
+
+    def scaled(cov, by):
+        return cov * by[..., :, None] * by[..., None, :]
+
+    unit = ten(-3, 3, n)  # of each state: metres beside degrees
+    noise = ten(-decades, decades, 1) * ten(-1, 1, m)
+    H = rng.normal(size=(runs, m, n)) / unit[:, None, :]
+    same = rng.random(runs) < 0.2
+    H[same] = H[same, :1]
+    R = scaled(spread_cov(rng, (runs,), m, full=1.0 if noisy else 0.8), noise)
+    diagonal, silent = rng.random(runs) < 0.5, rng.random((runs, m)) < (0.0 if noisy else 0.1)
+    R = np.where(diagonal[:, None, None], R * np.eye(m), R) * ~silent[:, :, None] * ~silent[:, None, :]
+    R = R.reshape(runs, 1, *modes, m, m) * ten(-4, 4, 1, *sizes, 1, 1)
+    F = np.eye(n) + 0.3 / n * rng.normal(size=(runs, n, n)) * unit[:, :, None] / unit[:, None, :]
+    Q = scaled(spread_cov(rng, (runs,), n), unit * ten(-decades, 0, 1))
+    z = rng.normal(size=(runs, n_steps, m)) * (1.0 + noise[:, None])
+    z = np.where(rng.random(z.shape) < 0.1, z * ten(0, min(farthest, 295.0), n_steps, m), z)
+    z[rng.random(z.shape) < 0.1] = np.nan
+    n_modes = int(np.prod(sizes))
+    return {
+        "z": z,
+        "F": F.reshape(runs, 1, *modes, n, n),
+        "Q": Q.reshape(runs, 1, *modes, n, n) * ten(-2, 2, 1, *sizes, 1, 1),
+        "H": H.reshape(runs, 1, *modes, m, n),
+        "R": R,
+        "trans": [random_trans(rng, s) for s in sizes],
+        "mean0": (unit * rng.normal(size=(runs, n))).reshape(runs, *modes, n),
+        "cov0": scaled(spread_cov(rng, (runs,), n), unit).reshape(runs, *modes, n, n),
+        "probs0": law(rng, (), n_modes).reshape(sizes),
+    }  # fmt: skip
+
+
+@st.composite
+def hostile_problems(draw, most_states=9, most_steps=4, chains=((), (2,), (3,), (2, 2)), farthest=300.0, noisy=False):
+    """`hostile_problem` of one to nine states and up to two measurements more than states, up to overflow."""
+    n = draw(st.integers(1, most_states))
+    m, n_steps, runs = draw(st.integers(1, n + 2)), draw(st.integers(1, most_steps)), draw(st.integers(1, 5))
+    size = draw(st.sampled_from([f for f in (0.0, 3.0, 16.0, 150.0, 300.0) if f <= farthest]))
+    decades = draw(st.sampled_from([2.0, 8.0]))
+    return hostile_problem(draw(rngs()), runs, draw(st.sampled_from(chains)), n, m, n_steps, decades, size, noisy)
+
+
+def of_runs(p, which):
+    """Arguments of `hostile_problem` for some of its runs."""
+    return {name: a if name in ("trans", "probs0") else a[which] for name, a in p.items()}

@@ -7,7 +7,8 @@ import pytest
 
 from saltus.errors import DataError, ModelError
 from saltus.filters import imm_filter
-from saltus.filters.align import align
+from saltus.filters.align import align, covariances
+from strategies import spread_cov
 
 GOOD = {
     "z": np.zeros((4, 1)),
@@ -91,6 +92,23 @@ def test_rows_to_keep_are_checked():
     bare = inspect.unwrap(imm_filter)  # without the tests' type checks, as users call it
     with pytest.raises(ModelError, match='keep is "all" or "last"'):
         bare(**GOOD, keep="first")
+
+
+def test_no_covariance_is_refused_for_its_rank(rng):
+    """Nearly singular first pivots let rounding grow: the error of the next is that of the first over its size."""
+    for n in range(2, 10):
+        for _ in range(20):
+            cov = spread_cov(rng, (2000,), n, full=0.3)
+            assert covariances("Q", cov).shape == cov.shape
+
+
+def test_indefinite_by_one_part_in_a_hundred_thousand(rng):
+    cov = spread_cov(rng, (2000,), 5, full=0.0)
+    unit = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 1e-300))
+    worse = cov / unit[..., None] / unit[..., None, :] - 1e-5 * np.eye(5) * (unit > 1e-100)[..., None]
+    for one in worse[np.linalg.eigvalsh(worse)[:, 0] < -5e-6][:200]:
+        with pytest.raises(ModelError, match="not positive semidefinite"):
+            covariances("Q", one)
 
 
 def test_an_indefinite_matrix_among_many_is_found():

@@ -17,6 +17,7 @@ __all__ = ["Aligned", "align", "array", "covariances", "finite"]
 _Array = npt.NDArray[np.float64]
 _LARGE = 100_000  # elements above which reading an array once more is worth avoiding
 _INDEFINITE = 1e-8  # of a variance: a pivot below minus this is no rounding
+_DEAD = 1e-6  # of a variance: a pivot below this is not divided by, or rounding would grow to _INDEFINITE
 
 
 class Aligned(NamedTuple):
@@ -246,6 +247,10 @@ def covariances(name: str, a: _Array) -> _Array:
         raise ModelError(f"{name} is not symmetric at index {where}. A covariance equals its transpose.")
     a = 0.5 * (a + swapped)
     bad = _indefinite(a, scale)
+    if bad.any():  # to be sure: over many small pivots rounding grows all the same
+        unit = np.divide(a[bad], scale[bad], out=np.zeros_like(a[bad]), where=scale[bad] > 0)
+        without = ((a[bad] != 0) & (scale[bad] == 0)).any(axis=(-1, -2))
+        bad[bad] = without | (np.linalg.eigvalsh(unit)[..., 0] < -_INDEFINITE)
     if bad.any():
         where = [int(i) for i in np.argwhere(bad)[0]]
         at = f" at index {where}" if where else ""
@@ -260,8 +265,10 @@ def _indefinite(a: _Array, scale: _Array) -> npt.NDArray[np.bool_]:
     for j in range(a.shape[-1]):
         pivot, rest = unit[..., j, j], unit[..., j + 1 :, j]
         bad |= pivot < -_INDEFINITE
-        dead = pivot <= _INDEFINITE
-        bad |= dead & (np.abs(rest) > np.sqrt(_INDEFINITE)).any(axis=-1)
+        dead = pivot <= _DEAD
+        others = np.diagonal(unit, axis1=-2, axis2=-1)[..., j + 1 :]
+        most = 4.0 * (np.maximum(pivot, 0.0) + _INDEFINITE)[..., None] * (np.maximum(others, 0.0) + _INDEFINITE)
+        bad |= dead & (np.square(rest) > most).any(axis=-1)
         share = np.where(dead[..., None], 0.0, rest) / np.where(dead, 1.0, pivot)[..., None]
         unit = unit - np.pad(share[..., :, None] * rest[..., None, :], [(0, 0)] * (a.ndim - 2) + [(j + 1, 0)] * 2)
     return bad

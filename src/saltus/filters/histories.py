@@ -112,4 +112,6 @@ def _merging_cost(w: _Array, alone: npt.NDArray[np.bool_], before: _Array, after
     here = counts[..., None, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         gain = np.linalg.slogdet(np.where(here, after, one))[1] - np.linalg.slogdet(np.where(here, before, one))[1]
-    return np.asarray(0.5 * np.maximum(np.sum(w * np.where(np.isnan(gain), np.inf, gain), axis=1, where=counts), 0.0))
+    return np.asarray(
+        0.5 * np.maximum(np.sum(w * np.where(np.isfinite(gain), gain, np.inf), axis=1, where=counts), 0.0)
+    )

@@ -55,27 +55,24 @@ def filter_native(z: _Array, aligned: Callable[[bool], Aligned], run: Run) -> Es
         first, batch = int(bad[0]), z.shape[:-2]
         where = tuple(int(i) for i in np.unravel_index(first, batch)) if batch else ()
         refused = (faults[:, 0] != 0).reshape(batch)
-        raise of_runs(_refusal(faults[first], z[where], len(faults) - len(bad), where), refused)
+        raise of_runs(_refusal(faults[first], z[where], len(faults) - len(bad), where, int(faults[first, 1])), refused)
     return out
 
 
-def _refusal(fault: _Modes, z: _Array, others: int, run: tuple[int, ...] = ()) -> SaltusError:
-    """What a fault of the kernel means: its kind, row and component, with the (T, m) it happened in."""
-    kind, row, component = (int(i) for i in fault)
-    return _of_kind(kind, place(run, row, component), place(run, row), float(z[row, component]), others)
+def _refusal(fault: _Modes, z: _Array, others: int, run: tuple[int, ...] = (), row: int | None = None) -> SaltusError:
+    """What a fault of the kernel means, with the (T, m) it happened in and the row to name."""
+    kind, at, component = (int(i) for i in fault)
+    if kind == _NOT_POSITIVE:
+        return NotPositive(place(run, row, component), component)
+    if kind == _NOT_FINITE:
+        return not_finite(place(run, row))
+    return too_far(place(run, row, component), float(z[at, component]), others)
 
 
 def _refused_row(fault: _Modes, z: _Array) -> SaltusError:
     """The same for the rows of a bank, (k, m), each of them a run of its own."""
-    kind, row, component = (int(i) for i in fault)
-    told = _of_kind(kind, place([row], None, component), place([row]), float(z[row, component]), 0)
-    return of_runs(told, np.arange(len(z)) == row)
-
-
-def _of_kind(kind: int, where: str, at: str, value: float, others: int) -> SaltusError:
-    if kind == _NOT_POSITIVE:
-        return NotPositive(where)
-    return not_finite(at) if kind == _NOT_FINITE else too_far(where, value, others)
+    run = int(fault[1])
+    return of_runs(_refusal(fault, z, 0, (run,)), np.arange(len(z)) == run)
 
 
 def _run(z: _Array, model: Aligned, run: Run) -> tuple[Estimates, _Modes, int]:

@@ -82,7 +82,7 @@ def expanded(
     with np.errstate(divide="ignore"):
         law = np.log(trans)[now]
     prediction = steps.measure(x, P, H, d, R)
-    done = steps.condition(prediction, np.where(seen, z, 0.0)[:, None], seen[:, None])
+    done = steps.condition(prediction, np.where(seen, z, 0.0)[:, None], seen[:, None], n_runs=1)
     law, log_f = steps.reweigh(law, done.loglik, 1)
     return np.exp(law), log_f
 

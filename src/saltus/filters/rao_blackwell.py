@@ -14,14 +14,15 @@ Source: Doucet, de Freitas, Murphy and Russell (2000); all next modes before cho
 Clifford (2003), On-line inference for hidden Markov models via particle filters, JRSS B 65(4), for the choice.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from saltus.errors import ModelError
+from saltus.errors import ModelError, NumericalError, SaltusError
 from saltus.filters import steps
 from saltus.filters.align import align
 from saltus.filters.backend import Backend
@@ -29,7 +30,7 @@ from saltus.filters.bank import Bank
 from saltus.filters.estimates import Estimates
 from saltus.filters.flat import Flat, flatten
 from saltus.filters.particles import Tables, effective_size, generator, group_error, stated_error, thinned
-from saltus.filters.refusals import check_evidence
+from saltus.filters.refusals import NotPositive, check_evidence, not_finite, of_runs, place
 from saltus.linalg import logsumexp, normalised
 
 __all__ = ["check_groups", "particle_filter"]
@@ -93,7 +94,15 @@ def particle_filter(
     size = check_groups(n_particles, groups)
     model = align(z, F=F, Q=Q, H=H, R=R, trans=trans, mean0=mean0, cov0=cov0, probs0=probs0, b=b, d=d)
     flat = flatten(model)
-    parts = [_filter(part, size, groups, source, backend) for part in _divided(flat, size * groups)]
+    parts: list[_Rows] = []
+    for part in _divided(flat, size * groups):
+        first = sum(len(done.mean) for done in parts)
+        try:
+            parts.append(_filter(part, size, groups, source, backend, first))
+        except SaltusError as error:  # of a part: which of all runs
+            if error.runs is not None:
+                error.runs = np.pad(error.runs, (first, flat.n_runs - first - len(error.runs)))
+            raise
     rows = _Rows(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
     return _estimates(rows, flat, model.z.shape[:-2], per_mode)
 
@@ -155,7 +164,7 @@ def _divided(flat: Flat, n_particles: int) -> list[Flat]:
     return parts
 
 
-def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backend: Backend | None) -> _Rows:
+def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backend: Backend | None, first: int) -> _Rows:
     B, M = flat.n_runs, flat.n_modes
     lots = B * groups  # independent filters of `size` particles
     rows = np.arange(lots * size)
@@ -168,11 +177,12 @@ def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backen
     for k in range(flat.n_steps):
         tables, trans = _tables(flat, k), flat.trans(k)[0]
         z = np.repeat(z_all[:, k], groups * size, axis=0)
-        law, log_f = bank.expand(rows, mode, trans, z, tables)
+        with _by_run(B, first, k):
+            law, log_f = bank.expand(rows, mode, trans, z, tables)
         prediction, law_now = _predicted(now, flat, k)
         log_w, likelihood = normalised(log_w + log_f.reshape(lots, size), (1,))
         least = likelihood.reshape(B, groups).min(-1)
-        check_evidence(least, prediction.y, prediction.Y, flat.z[:, k], flat.seen[:, k], k)
+        check_evidence(least, prediction.y, prediction.Y, flat.z[:, k], flat.seen[:, k], k, first)
         share = np.exp(log_w)
         probs = (share[:, None, :] @ law.reshape(lots, size, M))[:, 0]
         bank, mode, log_w, lost = _branched(bank, log_w, law, rng)
@@ -181,7 +191,8 @@ def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backen
         bank.step(rows, [], F, b, Q, mode=mode)
         bank.update(rows, z, H, d, R, mode=mode)
         nis = steps.mixture_nis(law_now, prediction, flat.z[:, k], flat.seen[:, k], 1)
-        nearest = _nearest(law_now, prediction, flat, k)
+        with _by_run(B, first, k):
+            nearest = _nearest(law_now, prediction, flat, k)
         now, group_means, mean, cov = _moments(bank, rows, log_w, of_lot * M + mode, (B, groups, M))
         log_f_runs = logsumexp(likelihood.reshape(B, groups), (1,))[:, 0] - np.log(groups)
         out.append(
@@ -200,6 +211,22 @@ def _filter(flat: Flat, size: int, groups: int, rng: np.random.Generator, backen
             )
         )
     return _Rows(*(np.stack(arrays, axis=1) for arrays in zip(*out, strict=True)))
+
+
+@contextmanager
+def _by_run(n_runs: int, first: int, row: int) -> Iterator[None]:
+    """Let the bank's refusal of particles name their run, counted from `first`, and the row."""
+    try:
+        yield
+    except NumericalError as error:
+        if error.runs is None:
+            raise
+        refused = error.runs.reshape(n_runs, -1).any(axis=1)
+        run = [first + int(refused.argmax())]
+        told: NumericalError = not_finite(place(run, row))
+        if isinstance(error, NotPositive):
+            told = NotPositive(place(run, row, error.component), error.component)
+        raise of_runs(told, refused) from error
 
 
 def _start(
@@ -268,7 +295,7 @@ def _predicted(now: steps.Belief, flat: Flat, k: int) -> tuple[steps.Joint, _Arr
 
 def _nearest(law: _Array, prediction: steps.Joint, flat: Flat, k: int) -> _Array:
     """Squared distance of the measurement from what the nearest of the possible modes predicts."""
-    of_mode = steps.condition(prediction, flat.z[:, k, None], flat.seen[:, k, None]).d2
+    of_mode = steps.condition(prediction, flat.z[:, k, None], flat.seen[:, k, None], n_runs=1).d2
     return np.asarray(np.min(np.where(np.isfinite(law), of_mode, np.inf), axis=-1))
 
 

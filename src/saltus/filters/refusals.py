@@ -18,11 +18,12 @@ class NotPositive(NumericalError):
     """A measured component has neither noise nor uncertainty.
 
     Attributes:
-        where: of `place`.
+        where: of `place`, and
+        component: the number in it.
     """
 
-    def __init__(self, where: str) -> None:
-        self.where = where
+    def __init__(self, where: str, component: int | None = None) -> None:
+        self.where, self.component = where, component
         super().__init__(
             f"{where}: an innovation covariance S = H P H' + R is not positive definite: the component has neither "
             "noise nor uncertainty of its own. Give every measured component a positive variance in R."
@@ -75,6 +76,7 @@ def check_evidence(
     z: Float[np.ndarray, "*lead m"],
     seen: Bool[np.ndarray, "*lead m"],
     row: int | None = None,
+    first: int = 0,
 ) -> None:
     """Refuse what has no likelihood, and say of which run, row and component it is.
 
@@ -85,6 +87,7 @@ def check_evidence(
         z: the measurements.
         seen: what of them was seen.
         row: number of the row, if there is one.
+        first: number of the first run.
 
     Raises:
         DataError: a measurement is too far from what every mode predicts.
@@ -95,6 +98,7 @@ def check_evidence(
     if not len(bad):
         return
     run = tuple(int(i) for i in bad[0])
+    named = (run[0] + first, *run[1:]) if run else run
     (m, sources), lead = Y.shape[-2:], z.ndim - 1
     modes = y.shape[lead:-1]
     y = np.broadcast_to(y, (*z.shape[:-1], *modes, m))[run].reshape(-1, m)
@@ -103,11 +107,11 @@ def check_evidence(
         sigma = np.sqrt(np.sum(np.square(Y), axis=-1))
         away = np.where(seen[run], np.abs(z[run] - y) / sigma, 0.0)
     if not (np.isfinite(y).all() and np.isfinite(sigma).all()):
-        raise of_runs(not_finite(place(run, row)), refused)
+        raise of_runs(not_finite(place(named, row)), refused)
     mode = int(away.max(axis=-1).argmin())
     a = int(away[mode].argmax())
     predicted = f"{y[mode, a]:.6g} +- {sigma[mode, a]:.3g}"
-    told = too_far(place(run, row, a), float(z[run][a]), int(np.isfinite(log_f).sum()), predicted)
+    told = too_far(place(named, row, a), float(z[run][a]), int(np.isfinite(log_f).sum()), predicted)
     raise of_runs(told, refused)
 
 

@@ -38,6 +38,7 @@ __all__ = [
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
 _ROUNDING = 8.0 * float(np.finfo(np.float64).eps)  # of a row, below which what is left of it is rounding
+_BLUR = 4.0 * float(np.finfo(np.float64).eps)  # of a mean, by which rounding may part it from another
 FLOOR = 1e-290  # keeps the moments of a mode of probability zero defined, and touches nothing else
 
 
@@ -130,6 +131,7 @@ def _mix_axis(
     mu_t = (mu / mu.sum(-2, keepdims=True)).swapaxes(-1, -2)  # (..., j, i)
     xj = mu_t @ x
     spread = x[..., None, :, :] - xj[..., :, None, :]  # (..., j, i, n)
+    spread = np.where(np.abs(spread) > _BLUR * np.abs(x[..., None, :, :]), spread, 0.0)  # else rounding parts them
     Pj = (mu_t @ P.reshape((*P.shape[:-2], n * n))).reshape((*xj.shape, n))
     Pj = Pj + (mu_t[..., None] * spread).swapaxes(-1, -2) @ spread
     return Belief(np.moveaxis(lq, -1, axis), np.moveaxis(xj, -2, axis), np.moveaxis(symmetric(Pj), -3, axis))
@@ -229,9 +231,12 @@ def condition(
     if swept.empty.any():
         first = [int(i) for i in np.argwhere(swept.empty)[0]]
         refused = swept.empty.any(axis=tuple(range(n_runs, swept.empty.ndim)))
-        raise of_runs(NotPositive(place(first[:n_runs], row, first[-1])), refused)
+        raise of_runs(NotPositive(place(first[:n_runs], row, first[-1]), first[-1]), refused)
+    # What is known exactly has no variance: what rounding left of it would be believed by the next exact measurement.
+    left, whole = (np.sum(np.square(part), axis=-1) for part in (swept.rows, X))
+    rows = np.where((left <= _ROUNDING**2 * whole)[..., None], 0.0, swept.rows)
     loglik = np.asarray(-0.5 * (swept.d2 + swept.logdet + _LOG_2PI * seen.sum(-1)))
-    return Conditioned(mean - swept.left, _squares(swept.rows), loglik, swept.d2)
+    return Conditioned(mean - swept.left, _squares(rows), loglik, swept.d2)
 
 
 class _Swept(NamedTuple):

@@ -222,15 +222,13 @@ def _propagators(rates: Generator, dts: Float[np.ndarray, " t"]) -> dict[float, 
 
 def _filtered(given: Observation, axes: Axes) -> _Found:
     x = axes.states.reshape(-1, given.model.n_state)
-    n = x.shape[-1]
-    # First and second moments of the cells, so that one product gives the moments of all runs.
-    powers = np.concatenate([x, (x[:, :, None] * x[:, None, :]).reshape(len(x), -1)], axis=1)
     rows = []
     for step in _steps(given, axes):
         flat = step.p.reshape(*step.p.shape[:2], -1)
-        moments = flat.sum(axis=1) @ powers
-        mean = moments[:, :n]
-        cov = moments[:, n:].reshape(-1, n, n) - mean[:, :, None] * mean[:, None, :]
+        p = flat.sum(axis=1)
+        mean = p @ x
+        away = ((law[:, None], x - at) for law, at in zip(p, mean, strict=True))  # squares, never their difference
+        cov = np.array([(weight * off).T @ off for weight, off in away])
         rows.append(_Found(flat.sum(-1), mean, symmetric(cov), step.log_likelihood, step.nis))
     return _Found(*(np.stack(parts, axis=1) for parts in zip(*rows, strict=True)))
 
