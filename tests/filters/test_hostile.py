@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from diffusions import unchecked
-from saltus import IMM, Gaussian, HybridModel, PositionSensor, constant_velocity
+from saltus import IMM, Chain, Gaussian, HybridModel, PositionSensor, constant_velocity
 from saltus.errors import DataError, ModelError, SaltusError
 from saltus.filters import exact_filter, imm_filter, particle_filter
 from saltus.filters.run import in_order
@@ -72,3 +72,52 @@ def test_a_bad_record_is_named(records, message):
 def test_modes_of_different_size_say_how_to_embed_the_smaller():
     with unchecked(), pytest.raises(ModelError, match="All modes have one state vector"):
         imm_filter(np.zeros((3, 1)), **(ARRAYS | {"F": [np.eye(2), np.eye(3)]}))
+
+
+CHAIN = {"name": "a", "states": {"x": 1.0, "y": 2.0}, "stay": 0.9, "per": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"states": None}, "chain 'a' needs states: a mapping label -> value or a list of labels; got None"),
+        ({"states": 3}, "needs states"),
+        ({"stay": None, "per": None, "sojourn": 5.0}, "sojourn gives each state its own.*got 5.0"),
+        ({"stay": np.array([0.9, 0.8])}, r"stay is one probability, or one for each label.*shape \(2,\)"),
+    ],
+)
+def test_chains(wrong, message):
+    with unchecked(), pytest.raises(ModelError, match=message):
+        Chain(**{**CHAIN, **wrong})
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"dims": np.array([2, 3])}, {"axes": 1}, {"axes": [[0, 1]]}, {"axes": "ab"}, {"axes": [0.5, 1.5]}]
+)
+def test_axes_of_a_polar_sensor(wrong):
+    with unchecked(), pytest.raises(ModelError, match=r"PolarSensor (dims|axes) must be"):
+        PolarSensor(sigma_range=1.0, **wrong)
+
+
+@pytest.mark.parametrize("dt", [1e160, 1e300])
+def test_intervals_that_overflow(dt):
+    model = constant_velocity(dims=2, accel=1.0)
+    with pytest.raises(ModelError, match=r"overflows double precision\. dt is in seconds"):
+        model.step(np.array([dt]))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_only_our_own_errors_leave_the_constructors(seed):
+    rng = np.random.default_rng(seed)
+    odd = [*NONE_OF_THEM, 3, "ab", 1e300, -1e300, np.datetime64("2024-01-01"), np.timedelta64(4, "s"), object(), b"x"]
+    calls = {
+        Chain: dict(CHAIN),
+        PolarSensor: {"sigma_range": 1.0, "sigma_azimuth": 0.1, "dims": 2, "axes": (0, 2)},
+        PositionSensor: {"dims": 2, "sigma": 1.0},
+        Gaussian: {"mean": np.zeros(2), "cov": np.eye(2)},
+        constant_velocity: {"dims": 2, "accel": 1.0},
+    }
+    for make, good in calls.items():
+        for name in good:
+            value = odd[rng.integers(len(odd))]
+            refused_or_taken(lambda make=make, given={**good, name: value}: make(**given))

@@ -186,6 +186,8 @@ class Chain:
 def _states(name: str, states: Mapping[str, object] | Sequence[str]) -> dict[str, object]:
     if not isinstance(name, str) or not name or name in RESERVED:
         raise ModelError(f"a chain's name must be a word other than {', '.join(RESERVED)}; got {name!r}.")
+    if not isinstance(states, Mapping | Sequence):
+        raise ModelError(f"chain {name!r} needs states: a mapping label -> value or a list of labels; got {states!r}.")
     pairs = list(states.items()) if isinstance(states, Mapping) else [(label, label) for label in states]
     labels = [label for label, _ in pairs]
     if isinstance(states, str) or not labels or not all(isinstance(label, str) for label in labels):

@@ -30,6 +30,10 @@ class Labelled(NamedTuple):
 
 
 def _per_label(chain: Labelled, given: Mapping[str, float], what: str) -> FloatArray:
+    if not isinstance(given, Mapping):
+        raise ModelError(
+            f"chain {chain.name!r}: {what} gives each state its own, {{{chain.labels[0]!r}: ..., ...}}; got {given!r}."
+        )
     if set(given) != set(chain.labels):
         raise ModelError(
             f"chain {chain.name!r}: {what} must name each state once: "
@@ -54,7 +58,13 @@ def stay_matrix(chain: Labelled, stay: float | Mapping[str, float]) -> FloatArra
     if isinstance(stay, Mapping):
         probs = _per_label(chain, stay, "stay")
     else:
-        probs = np.full(len(chain.labels), float(numbers(stay, f"chain {chain.name!r}: stay")))
+        one = numbers(stay, f"chain {chain.name!r}: stay")
+        if one.ndim:
+            raise ModelError(
+                f"chain {chain.name!r}: stay is one probability, or one for each label, {{{chain.labels[0]!r}: ..., "
+                f"...}}; got an array of shape {one.shape}."
+            )
+        probs = np.full(len(chain.labels), float(one))
     if not ((probs >= 0) & (probs <= 1)).all() or (len(chain.labels) == 1 and probs[0] != 1):
         raise ModelError(
             f"chain {chain.name!r}: stay must be a probability for each state (1 if there is only one), "

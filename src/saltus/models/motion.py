@@ -162,7 +162,13 @@ class Motion:
         axes = max(noise.ndim, tau.ndim)
         step = intervals(dt)
         step = step.reshape(*step.shape, *(1,) * axes)
-        F, Q = (_blocks(block, self.dims) for block in law.blocks(step, noise, tau))
+        with np.errstate(over="ignore", invalid="ignore"):
+            F, Q = (_blocks(block, self.dims) for block in law.blocks(step, noise, tau))
+        if not (np.isfinite(F).all() and np.isfinite(Q).all()):
+            raise ModelError(
+                f"{self.law} motion over {np.max(step):g} s overflows double precision. dt is in seconds: check its "
+                "unit."
+            )
         if self.turn is not None:
             kind: Literal["scan", "white"] = "scan" if self.law == "velocity-scan" else "white"
             level = _density(noise, tau) if self.law == "velocity" else noise

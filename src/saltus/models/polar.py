@@ -5,6 +5,7 @@ Azimuth counts from north, clockwise, where the first two axes of the state are 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import index
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -79,7 +80,7 @@ class PolarSensor:
     def __post_init__(self) -> None:
         put = object.__setattr__
         probability(self.prob_detection, "prob_detection")
-        if self.dims not in (2, 3):
+        if not isinstance(self.dims, int | np.integer) or self.dims not in (2, 3):
             raise ModelError(f"PolarSensor dims must be 2 (east, north) or 3 (east, north, up), got {self.dims!r}.")
         if not self.components:
             raise ModelError("PolarSensor measures nothing: give sigma_range, sigma_azimuth, ... of what it measures.")
@@ -87,7 +88,11 @@ class PolarSensor:
             raise ModelError("PolarSensor measures elevation only in three dimensions: pass dims=3.")
         for name, places in (("axes", self.axes), ("velocities", self.velocities)):
             if places is not None:
-                put(self, name, tuple(int(i) for i in places))
+                try:
+                    put(self, name, tuple(index(i) for i in places))
+                except TypeError:
+                    told = f"PolarSensor {name} must be {self.dims} different indices, got {places!r}."
+                    raise ModelError(told) from None
                 if len(set(places)) != self.dims or len(places) != self.dims or min(places) < 0:
                     raise ModelError(f"PolarSensor {name} must be {self.dims} different indices, got {places}.")
         if self.observer is not None and np.shape(self.observer.position)[-1] != self.dims:
