@@ -87,6 +87,7 @@ def _pointer(folder: Path) -> dict[str, Any] | None:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (UnicodeDecodeError, ValueError) as error:
         raise DataError(f"{path}: no readable checkpoint: {error}. Begin anew.") from error
-    if not isinstance(found, dict):
+    named = str(found.get("state")) if isinstance(found, dict) else ""
+    if Path(named).name != named or not named.startswith("state-") or not isinstance(found.get("number"), int):
         raise DataError(f"{path}: no checkpoint. Begin anew.")
     return found
