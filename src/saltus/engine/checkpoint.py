@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +18,7 @@ __all__ = ["begin_anew", "has_checkpoint", "load_checkpoint", "save_checkpoint"]
 
 FORMAT = 1
 _POINTER = "checkpoint.json"
+_STATE = re.compile(r"state-\d{6}\.npz")
 
 
 def has_checkpoint(folder: Path) -> bool:
@@ -87,7 +89,6 @@ def _pointer(folder: Path) -> dict[str, Any] | None:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (UnicodeDecodeError, ValueError) as error:
         raise DataError(f"{path}: no readable checkpoint: {error}. Begin anew.") from error
-    named = str(found.get("state")) if isinstance(found, dict) else ""
-    if Path(named).name != named or not named.startswith("state-") or not isinstance(found.get("number"), int):
-        raise DataError(f"{path}: no checkpoint. Begin anew.")
-    return found
+    if isinstance(found, dict) and isinstance(found.get("number"), int) and _STATE.fullmatch(str(found.get("state"))):
+        return found
+    raise DataError(f"{path}: no checkpoint. Begin anew.")
