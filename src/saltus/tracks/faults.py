@@ -19,7 +19,7 @@ from saltus.records import Kind
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import TrackerSettings
 
-__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law", "weighty"]
+__all__ = ["History", "PlotLaw", "SourceCondition", "plot_law", "rays", "weighty"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -89,13 +89,24 @@ class PlotLaw:
         if "range" not in self.components:
             each = np.ones((len(index), 1))
             return each[..., None, None] * np.eye(2), 0.5 * np.trace(R, axis1=1, axis2=2)[:, None], each * self.outlier
-        ray = m.ray[index]
+        ray = rays(m, index, self.outlier)
         distance = np.hypot(ray[:, 0], ray[:, 1])
         u = ray / distance[:, None]
         direction = np.stack([np.stack([-u[:, 1], u[:, 0]], axis=-1), u], axis=1)
         variance = np.einsum("kai,kij,kaj->ka", direction, R, direction)
         wrong = np.stack([self.outlier[0] * distance, np.minimum(self.outlier[1], _FAULTY_SHARE * distance)], axis=-1)
         return direction[..., :, None] * direction[..., None, :], variance, wrong
+
+
+def rays(m: Measurements, index: _Index, outlier: _Array) -> _Array:
+    """Return rays (k, 2) of plots of a radar; of a position told without range and azimuth, one that may be as wrong.
+
+    Args:
+        m: the measurements.
+        index: of the plots.
+        outlier: deviations of faulty azimuths, rad, and ranges, m: such a position may be wrong by the latter each way.
+    """
+    return np.where(np.isnan(m.ray[index]), [0.0, outlier[1] / outlier[0]], m.ray[index])
 
 
 def weighty(p: _Array) -> tuple[_Index, _Index, _Index]:

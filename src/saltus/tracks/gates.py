@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.tracks.associate import Pairs, equal_codes, join_pairs, near_pairs
-from saltus.tracks.faults import SourceCondition
+from saltus.tracks.faults import SourceCondition, rays
 from saltus.tracks.identity import conflicting
 from saltus.tracks.kinematics import Kinematics, Plan
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
@@ -283,7 +283,7 @@ class _Bounds(NamedTuple):
         """Deviation of a faulty plot."""
         if len(self.outlier) == 1:
             return np.full(len(plot), np.sqrt(2.0) * self.outlier[0])
-        return np.asarray(np.hypot(self.outlier[1], self.outlier[0] * np.hypot(m.ray[plot, 0], m.ray[plot, 1])))
+        return np.asarray(np.hypot(self.outlier[1], self.outlier[0] * np.hypot(*rays(m, plot, self.outlier).T)))
 
 
 def _chi2_quantile(probability: float, dof: int) -> float:
