@@ -70,10 +70,31 @@ def test_other_sources_and_another_place_are_refused(saved):
     strangers = replace(strangers, kind=np.full(len(plots), Kind.GEODETIC, np.int8))
     strangers = replace(strangers, latitude=np.full(len(plots), 0.8), longitude=np.full(len(plots), 0.2))
     with pytest.raises(DataError, match="other sources: of CAT048:1/1, CAT048:1/2; the reports are of CAT048:7/0"):
-        Session.open(path).feed(strangers)
+        _tracked(path, strangers)
     far = replace(strangers, sources=plots.sources, longitude=np.full(len(plots), -2.9))
     with pytest.raises(DataError, match=r"another place, \d+ km from the reports. Learn one from these reports with"):
-        Session.open(path).feed(far)
+        _tracked(path, far)
+
+
+@pytest.mark.parametrize("chunk", [1, 5, 100])
+def test_the_pieces_do_not_decide_whether_a_setup_fits(saved, chunk):
+    """The first report is of a source that the setup does not know, the others are not; or all are."""
+    path, plots, _ = saved
+    sources = (*plots.sources, Source(System(48, 9, 9), plots.sources[0].traits))
+    some, all_ = plots.source.copy(), np.full(len(plots), 2, plots.source.dtype)
+    some[0] = 2
+    place = {"kind": np.full(len(plots), Kind.GEODETIC, np.int8), "latitude": np.full(len(plots), 0.84)}
+    place["longitude"] = np.full(len(plots), 0.19)
+    for source, fits in ((some, True), (all_, False)):
+        mixed = replace(plots, sources=sources, source=source, **place).take(slice(0, 100))
+        session = Session.open(path, hold=0.0)
+        for begin in range(0, 100, chunk):
+            session.feed(mixed.take(slice(begin, begin + chunk)))
+        if fits:
+            assert len(session.finish().assignments) == 100
+        else:
+            with pytest.raises(DataError, match="the reports are of CAT048:9/9"):
+                session.finish()
 
 
 def test_a_session_saved_before_its_first_report_still_refuses(saved, tmp_path):
@@ -81,8 +102,16 @@ def test_a_session_saved_before_its_first_report_still_refuses(saved, tmp_path):
     Session.open(path).save(tmp_path)
     session = Session.restore(tmp_path)
     alien = Plots.build(1, (Source(System(None, None, None, "boat")),), ("x",), _position(60.0, 5.0))
+    session.feed(alien)
+    session.save(tmp_path)
     with pytest.raises(DataError, match="the reports are of boat"):
-        session.feed(alien)
+        Session.restore(tmp_path).finish()
+
+
+def _tracked(path, plots):
+    session = Session.open(path)
+    session.feed(plots)
+    return session.finish()
 
 
 def _position(latitude, longitude):

@@ -12,7 +12,7 @@ from saltus import Session
 from saltus.config import load_config
 from saltus.engine import Setup
 from saltus.errors import DataError
-from saltus.records import REASONS, Source, System, Traits
+from saltus.records import REASONS, Kind, Source, System, Traits
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +159,33 @@ def test_a_session_without_usable_reports_says_so(config):
         session.finish()
 
 
+def test_a_damaged_journal_is_noticed_before_the_run_goes_on(config, tmp_path, monkeypatch):
+    monkeypatch.setattr("saltus.engine.journal._ROWS", 200)
+    session = Session.open(config, folder=tmp_path)
+    session.feed(scene(2))
+    session.save(tmp_path)
+    segment = tmp_path / "plots-000000.arrow"
+    whole = segment.read_bytes()
+    for broken in (b"", whole[:500], None):
+        segment.write_bytes(broken) if broken is not None else segment.unlink()
+        with pytest.raises(DataError, match=r"plots-000000.arrow: the journal's segment cannot be read"):
+            Session.restore(tmp_path)
+    segment.write_bytes(whole)
+    equal(session.finish(), Session.restore(tmp_path).finish())
+
+
+def test_a_folder_of_another_session_is_cleared_first(config, tmp_path, monkeypatch):
+    monkeypatch.setattr("saltus.engine.journal._ROWS", 200)
+    first = Session.open(config)
+    first.feed(scene(2))
+    first.save(tmp_path)
+    (tmp_path / "mine.txt").write_text("kept")
+    second = Session.open(config)
+    second.feed(scene(1).take(slice(0, 50)))
+    second.save(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint.json", "mine.txt", "state-000000.npz"]
+
+
 def test_what_is_no_checkpoint_is_said(config, tmp_path):
     with pytest.raises(DataError, match="holds no checkpoint"):
         Session.restore(tmp_path)
@@ -173,10 +200,54 @@ def test_what_is_no_checkpoint_is_said(config, tmp_path):
     pointer.write_text(json.dumps(found)[:-20])
     with pytest.raises(DataError, match="no readable checkpoint"):
         Session.restore(tmp_path)
+    for state in ("../victim.npz", str(tmp_path / "victim"), "state-1.npz", None):
+        pointer.write_text(json.dumps({**found, "state": state}))
+        with pytest.raises(DataError, match="no checkpoint"):
+            Session.restore(tmp_path)
+        with pytest.raises(DataError, match="no checkpoint"):
+            session.save(tmp_path)
     pointer.write_text(json.dumps(found))
-    (tmp_path / found["state"]).write_bytes(b"PK")
-    with pytest.raises(DataError, match="cannot be read"):
-        Session.restore(tmp_path)
+    state = tmp_path / found["state"]
+    whole = state.read_bytes()
+    changed = bytearray(whole)
+    changed[len(whole) // 2] ^= 0xFF
+    for broken in (b"", b"PK", whole[:1000], whole[:-30], bytes(changed)):
+        state.write_bytes(broken)
+        with pytest.raises(DataError, match=r"the checkpoint there .* Begin anew"):
+            Session.restore(tmp_path)
+    state.write_bytes(whole)
+    for name in ("words", *found["words"]):
+        less = json.loads(json.dumps(found))
+        (less if name == "words" else less["words"]).pop(name)
+        pointer.write_text(json.dumps(less))
+        with pytest.raises(DataError, match="the checkpoint there cannot be read"):
+            Session.restore(tmp_path)
+    pointer.write_text(json.dumps(found))
+    Session.restore(tmp_path)
     session.finish()
     with pytest.raises(DataError, match="has ended"):
         session.feed(scene(1))
+
+
+def test_a_radar_that_tells_positions_alone_later_is_tracked_on(config):
+    """Its faults were those of range and azimuth: a position without them is no reason to stop."""
+    plots = scene(1, seconds=160.0)
+    late = plots.time > 100.0
+    east, north = plots.range * np.sin(plots.azimuth), plots.range * np.cos(plots.azimuth)
+    kind = np.where(late, Kind.PLANE, plots.kind).astype(np.int8)
+    mixed = replace(plots, kind=kind, x=np.where(late, east, np.nan), y=np.where(late, north, np.nan))
+    for reports, part in ((mixed, late), (replace(mixed, kind=np.full(len(plots), Kind.PLANE, np.int8)), late)):
+        found = fed(config, replace(reports, x=east, y=north))[0].assignments
+        used = found["track_id"].is_valid().to_numpy()
+        assert used[part].mean() > 0.6  # eight aircraft of nine in ten scans, beside three false plots
+
+
+def test_a_radar_of_positions_that_appears_later_is_tracked(config):
+    plots = scene(2, seconds=160.0)
+    plots = plots.take((plots.source == 0) | (plots.time > 70.0))
+    second = plots.source == 1
+    kind = np.where(second, Kind.PLANE, plots.kind).astype(np.int8)
+    east, north = plots.range * np.sin(plots.azimuth), plots.range * np.cos(plots.azimuth)
+    found = fed(config, replace(plots, kind=kind, x=east, y=north))[0].assignments
+    used = found["track_id"].is_valid().to_numpy()
+    assert used[second & (plots.time > 100.0)].mean() > 0.6

@@ -3,7 +3,9 @@
 import json
 import os
 import re
-from collections.abc import Mapping
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,11 +16,12 @@ from saltus.engine.arrays import flattened, nested
 from saltus.engine.journal import SCHEMA
 from saltus.errors import DataError
 
-__all__ = ["begin_anew", "has_checkpoint", "load_checkpoint", "save_checkpoint"]
+__all__ = ["begin_anew", "has_checkpoint", "load_checkpoint", "save_checkpoint", "understood"]
 
 FORMAT = 1
 _POINTER = "checkpoint.json"
 _STATE = re.compile(r"state-\d{6}\.npz")
+_OURS = re.compile(rf"{_STATE.pattern}|[a-z]+-\d{{6}}\.arrow")
 
 
 def has_checkpoint(folder: Path) -> bool:
@@ -27,8 +30,11 @@ def has_checkpoint(folder: Path) -> bool:
 
 
 def begin_anew(folder: Path) -> None:
-    """Forget the state saved in a folder, whose journal is about to be written anew."""
+    """Forget the state saved in a folder, and remove its journal, which is about to be written anew."""
     (folder / _POINTER).unlink(missing_ok=True)
+    for path in sorted(folder.glob("*-*")):
+        if _OURS.fullmatch(path.name):
+            path.unlink()
 
 
 def save_checkpoint(folder: Path, state: Mapping[str, Any], words: Mapping[str, Any]) -> None:
@@ -67,18 +73,32 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     found = _pointer(folder)
     if found is None:
         raise DataError(f"{folder}: holds no checkpoint ({_POINTER}). Name the folder that --checkpoint named.")
-    if (found.get("format"), found.get("journal")) != (FORMAT, SCHEMA):
+    if [found.get(name) for name in ("format", "journal", "saltus")] != [FORMAT, SCHEMA, version("saltus")]:
         raise DataError(
             f"{folder}: the checkpoint is of format {found.get('format')} with a journal of version "
             f"{found.get('journal')} (saltus {found.get('saltus')}); this is saltus {version('saltus')}, format "
             f"{FORMAT} and version {SCHEMA}. Go on with the version that wrote it, or begin anew without --resume."
         )
+    with (
+        understood(folder),
+        (folder / str(found["state"])).open("rb") as file,
+        np.load(file, allow_pickle=False) as arrays,
+    ):
+        return nested({name: arrays[name] for name in arrays.files}), dict(found["words"])
+
+
+@contextmanager
+def understood(folder: Path) -> Iterator[None]:
+    """Refuse a checkpoint that does not hold what it should, whatever is wrong with it."""
     try:
-        with np.load(folder / str(found["state"]), allow_pickle=False) as arrays:
-            state = nested({name: arrays[name] for name in arrays.files})
-    except (OSError, ValueError, KeyError) as error:
-        raise DataError(f"{folder}: the checkpoint's {found['state']} cannot be read: {error}. Begin anew.") from error
-    return state, found["words"]
+        yield
+    except (OSError, EOFError, LookupError, TypeError, ValueError, AttributeError, StopIteration) as error:
+        raise DataError(f"{folder}: the checkpoint there cannot be read: {error}. {_CURE}") from error
+    except zipfile.BadZipFile as error:
+        raise DataError(f"{folder}: the checkpoint there is cut short or changed: {error}. {_CURE}") from error
+
+
+_CURE = "Begin anew without --resume."
 
 
 def _pointer(folder: Path) -> dict[str, Any] | None:

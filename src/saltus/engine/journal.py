@@ -6,7 +6,7 @@ kind are an interface, `SCHEMA` its version.
 
 | kind | a row | columns |
 | --- | --- | --- |
-| `reports` | report received, in order of arrival | `time`, `source`, `file`, `record`, `reason` |
+| `reports` | report received, in order of arrival | `time`, `source`, `file`, `record`, `local_id`, `reason` |
 | `plots` | report placed, in order of time | those of `Measurements`; `plot` is the report's number, from 0 |
 | `rows` | state published by a local tracker | those of `Rows`; `system` |
 | `fates` | what became of a plot; of two the later holds | those of `Fates`; `system` |
@@ -29,13 +29,15 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from saltus.engine.arrays import from_table, joined, to_table
+from saltus.errors import DataError
 
-__all__ = ["SCHEMA", "Journal"]
+__all__ = ["SCHEMA", "Journal", "foreign_columns"]
 
 _Array = npt.NDArray[Any]
 
 SCHEMA = 1
 _ROWS = 1 << 16  # of a segment
+_FOREIGN = ("time", "track_number", "latitude", "longitude", "vx", "vy", "coasted")
 
 
 class Journal:
@@ -74,9 +76,13 @@ class Journal:
         parts = list(self.parts(kind))
         return joined(parts) if parts else None
 
+    def lies_in(self, folder: Path) -> bool:
+        """Say whether it is written in that folder."""
+        return folder.resolve() == self._folder.resolve()
+
     def move(self, folder: Path) -> None:
         """Go on in another folder: what is sealed is copied there."""
-        if folder.resolve() == self._folder.resolve():
+        if self.lies_in(folder):
             return
         folder.mkdir(parents=True, exist_ok=True)
         for kind, count in self._sealed.items():
@@ -97,10 +103,16 @@ class Journal:
         return {"sealed": {kind: np.array(n) for kind, n in self._sealed.items()}, "waiting": waiting}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on in the journal's folder from what `state` gave; segments sealed later are written anew."""
+        """Go on in the journal's folder from what `state` gave; segments sealed later are written anew.
+
+        Raises:
+            DataError: a segment is missing or damaged.
+        """
         self._sealed = {kind: int(n) for kind, n in state.get("sealed", {}).items()}
         self._waiting = {kind: [dict(columns)] for kind, columns in state.get("waiting", {}).items()}
         self._count = {kind: len(next(iter(parts[0].values()))) for kind, parts in self._waiting.items()}
+        for path in (self._path(kind, k) for kind, n in self._sealed.items() for k in range(n)):
+            _check(path)
 
     def _seal(self, kind: str) -> None:
         """Write whole segments."""
@@ -119,6 +131,30 @@ class Journal:
 
     def _path(self, kind: str, k: int) -> Path:
         return self._folder / f"{kind}-{k:06d}.arrow"
+
+
+def foreign_columns(tracks: pa.Table) -> dict[str, _Array]:
+    """Return another centre's tracks as columns: numbers, and text that is empty where there is none."""
+    out: dict[str, _Array] = {}
+    for name in ("system", "mode3a", "icao24"):
+        out[name] = np.array([str(v or "") for v in tracks[name].to_pylist()], str)
+    for name in _FOREIGN:
+        out[name] = np.asarray(tracks[name].to_numpy(zero_copy_only=False), np.float64)
+    return out
+
+
+def _check(path: Path) -> None:
+    """Refuse a segment that does not hold its rows."""
+    try:
+        with pa.memory_map(str(path)) as source:
+            found = pa.ipc.open_file(source)
+            rows = sum(found.get_batch(k).num_rows for k in range(found.num_record_batches))
+    except (OSError, pa.ArrowException) as error:
+        raise DataError(
+            f"{path}: the journal's segment cannot be read: {error}. Begin anew without --resume."
+        ) from error
+    if rows != _ROWS:
+        raise DataError(f"{path}: {rows} rows where a segment has {_ROWS}. Begin anew without --resume.")
 
 
 def _write(path: Path, content: bytes) -> None:

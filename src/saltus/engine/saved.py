@@ -17,23 +17,21 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from saltus.config import Config
 from saltus.engine.setup import SensorSetup, Setup, given_noise, site_of
 from saltus.engine.stored import sensor_words
-from saltus.errors import DataError, ModelError
+from saltus.errors import ModelError
 from saltus.geo import Plane
-from saltus.records import Kind, Plots, Source
+from saltus.records import Kind, Source
 from saltus.text import brief
 from saltus.toml import LARGEST
 from saltus.tracks.background import Background
 from saltus.tracks.measurements import Noise
 from saltus.tracks.noise import NoiseEstimate
 
-__all__ = ["refuse_another", "saved_setup", "setup_toml"]
+__all__ = ["saved_setup", "setup_toml"]
 
 _VERSION = 1
 _FORMS = {"cell": "<i8", "near": "<f8", "known": "<f8", "layer": "<i8", "count": "<f8"}  # arrays of a Background
 _MOST = 1 << 27  # bytes of one array
 _KINDS = {"polar": Kind.POLAR, "plane": Kind.PLANE, "bearing": Kind.BEARING}
-_FAR = 1e6  # m from the middle of the plane: another place
-_EARTH = 6.371e6  # m
 _OF_CONFIG = ("name", "system", "site", "given")  # of a sensor: what the configuration says, and is asked anew
 
 
@@ -154,39 +152,6 @@ def saved_setup(config: Config, *, use_identity: bool) -> Setup | None:
 
 
 _CURE = "Write the file anew with saltus setup."
-
-
-def refuse_another(setup: Setup, plots: Plots) -> None:
-    """Refuse usable reports for which a setup was not made.
-
-    Raises:
-        DataError: none of their sources is in it, or they lie elsewhere.
-    """
-    known = [s.source.system for s in setup.sensors]
-    found = [plots.sources[k].system for k in np.unique(plots.source).tolist()]
-    if not any(system in known for system in found):
-        of, here = (", ".join(map(str, systems)) for systems in (known, found))
-        raise DataError(f"the setup is one of other sources: of {of}; the reports are of {here}. {_LEARN}")
-    sites = [s.site for s in setup.sensors if s.site is not None and s.source.system in found]
-    at = np.flatnonzero(np.isfinite(plots.latitude) & np.isfinite(plots.longitude))
-    latitude = np.concatenate([plots.latitude[at], [s.latitude for s in sites]])
-    longitude = np.concatenate([plots.longitude[at], [s.longitude for s in sites]])
-    if not len(latitude):
-        return
-    there = np.median(_directions(latitude, longitude), axis=0)
-    middle = _directions(np.array([setup.plane.latitude]), np.array([setup.plane.longitude]))[0]
-    away = _EARTH * float(np.arctan2(np.linalg.norm(np.cross(there, middle)), there @ middle))
-    if away > _FAR:
-        raise DataError(f"the setup is one of another place, {away / 1000:.0f} km from the reports. {_LEARN}")
-
-
-_LEARN = "Learn one from these reports with saltus setup."
-
-
-def _directions(latitude: npt.NDArray[np.float64], longitude: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return unit vectors (n, 3) of places on a sphere."""
-    c = np.cos(latitude)
-    return np.column_stack([c * np.cos(longitude), c * np.sin(longitude), np.sin(latitude)])
 
 
 def _sensor(learnt: _Sensor, config: Config) -> SensorSetup:

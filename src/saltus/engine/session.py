@@ -10,17 +10,18 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from saltus.config import Config, load_config
-from saltus.engine.checkpoint import load_checkpoint, save_checkpoint
+from saltus.engine.checkpoint import begin_anew, load_checkpoint, save_checkpoint, understood
 from saltus.engine.intake import Arrived, Intake, Leap, numbered
-from saltus.engine.journal import Journal
+from saltus.engine.journal import Journal, foreign_columns
 from saltus.engine.learn import first_setup, usable, with_new_sources
 from saltus.engine.local import LocalTracking
 from saltus.engine.news import News, no_identifications
 from saltus.engine.result import Result, finished
-from saltus.engine.saved import refuse_another, saved_setup
+from saltus.engine.saved import saved_setup
 from saltus.engine.setup import Setup, site_of
 from saltus.engine.stored import config_from, setup_from, setup_state, source_from, source_words
 from saltus.engine.stretch import Stretch
+from saltus.engine.vetting import Vetting
 from saltus.errors import DataError
 from saltus.progress import Progress
 from saltus.records import REASONS, Plots, Source
@@ -33,7 +34,6 @@ _Index = npt.NDArray[np.int64]
 _SITE_UNKNOWN = REASONS.index("site unknown")
 _HOLD = 2.0  # s that reports may come late
 _CONDITIONS = 4  # most that a source has
-_FOREIGN = ("time", "track_number", "latitude", "longitude", "vx", "vy", "coasted")
 
 
 class Published(NamedTuple):
@@ -56,6 +56,8 @@ class Session:
     What becomes of a report depends on those before it, on the setup and on the times that reports tell, never on the
     pieces in which they come, nor on when a session was saved and restored.
     """
+
+    _vetting: Vetting | None
 
     def __init__(self, setup: Setup, *, hold: float = _HOLD, folder: Path | None = None) -> None:
         """Begin with a setup.
@@ -102,7 +104,7 @@ class Session:
     def _take_setup(self, setup: Setup) -> None:
         """Begin with a setup that was learnt before."""
         self._sources.extend(s.source for s in setup.sensors)
-        self._own_setup = False
+        self._vetting = Vetting()  # until it is found to fit the reports
         self._adopt(setup)
 
     def _begin(
@@ -125,7 +127,7 @@ class Session:
         self._news = News()
         self.notes: dict[str, Any] = {}  # what the caller of `save` wanted to find again
         self._ended = False
-        self._own_setup = True  # learnt from these reports, or found to fit them
+        self._vetting = None
 
     @property
     def reports(self) -> int:
@@ -161,12 +163,11 @@ class Session:
         if self._ended:
             raise DataError("the session has ended; open another one.")
         if tracks is not None and len(tracks):
-            self._journal.append("foreign", _foreign_columns(tracks))
+            self._journal.append("foreign", foreign_columns(tracks))
         plots, number = self._entered(reports)
         good = plots.reason == 0
-        if not self._own_setup and good.any():
-            refuse_another(self.setup, plots.take(good))
-            self._own_setup = True
+        if self._vetting is not None and self._vetting.fits(self._setups[0], plots.take(good), last=False):
+            self._vetting = None
         self._arrived(self._intake.add(plots.take(good), number[good]))
         return self._published()
 
@@ -191,6 +192,8 @@ class Session:
         if self._ended:
             raise DataError("the session has ended; open another one.")
         none = Plots.build(0, tuple(self._sources), tuple(self._files), {})
+        if self._vetting is not None:
+            self._vetting.fits(self._setups[0], none, last=True)
         self._arrived(self._intake.end(none))
         if not self._setups:
             self._learn()
@@ -328,6 +331,8 @@ class Session:
         if self._ended:
             raise DataError("the session has ended: there is nothing to go on with.")
         folder = Path(folder)
+        if not self._journal.lies_in(folder):
+            begin_anew(folder)  # of another session
         self._journal.move(folder)
         setups = [setup_state(setup) for setup in self._setups]
         state = {
@@ -337,6 +342,7 @@ class Session:
             "setup": {str(k): arrays for k, (arrays, _) in enumerate(setups)},
             "local": {str(own): tracking.state() for own, tracking in self._locals.items()},
             "news": self._news.state(),
+            "vetting": {} if self._vetting is None else self._vetting.state(),
         }
         told = {
             "config": self._config.model_dump(mode="json"),
@@ -345,7 +351,6 @@ class Session:
             "hold": self._hold,
             "sources": [source_words(s) for s in self._sources],
             "files": self._files,
-            "own_setup": self._own_setup,
             "reports": self._n,
             "setups": [words for _, words in setups],
             "leaps": [leap._asdict() for leap in self._intake.leaps],
@@ -363,36 +368,29 @@ class Session:
         folder = Path(folder)
         state, words = load_checkpoint(folder)
         session = cls.__new__(cls)
-        config = config_from(words["config"])
-        session._begin(config, words["use_identity"], words["periods"], words["hold"], folder, bar or Progress())
-        session.notes = words["notes"]
-        session._sources.extend(source_from(s) for s in words["sources"])
-        session._files.extend(words["files"])
-        session._n, session._own_setup = int(words["reports"]), bool(words["own_setup"])
-        for k, told in enumerate(words["setups"]):
-            session._setups.append(setup_from(state["setup"].get(str(k), {}), told))
-        like = Plots.build(0, tuple(session._sources), tuple(session._files), {})
-        session._intake.restore(state["intake"], like)
-        session._intake.leaps = [Leap(**leap) for leap in words["leaps"]]
-        session._stretch.restore(state.get("stretch", {}), like)
-        session._journal.restore(state.get("journal", {}))
-        session._news.restore(state["news"])
-        for own, local in state.get("local", {}).items():
-            party = next(p for p in session.setup.parties() if p.sources[0] == int(own))
-            session._locals[int(own)] = LocalTracking(session.setup, party)
-            session._locals[int(own)].restore(local)
+        with understood(folder):
+            config = config_from(words["config"])
+            session._begin(config, words["use_identity"], words["periods"], words["hold"], folder, bar or Progress())
+            session.notes = words["notes"]
+            session._sources.extend(source_from(s) for s in words["sources"])
+            session._files.extend(words["files"])
+            session._n = int(words["reports"])
+            for k, told in enumerate(words["setups"]):
+                session._setups.append(setup_from(state["setup"].get(str(k), {}), told))
+            like = Plots.build(0, tuple(session._sources), tuple(session._files), {})
+            session._intake.restore(state["intake"], like)
+            session._intake.leaps = [Leap(**leap) for leap in words["leaps"]]
+            session._stretch.restore(state.get("stretch", {}), like)
+            session._journal.restore(state.get("journal", {}))
+            session._news.restore(state["news"])
+            if "vetting" in state:
+                session._vetting = Vetting(state["vetting"])
+            for own, local in state.get("local", {}).items():
+                party = next(p for p in session.setup.parties() if p.sources[0] == int(own))
+                session._locals[int(own)] = LocalTracking(session.setup, party)
+                session._locals[int(own)].restore(local)
         return session
 
 
 def _all(value: int, like: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
     return np.full(len(like), value, np.int32)
-
-
-def _foreign_columns(tracks: pa.Table) -> dict[str, npt.NDArray[Any]]:
-    """Another centre's tracks as arrays: numbers, and text that is empty where there is none."""
-    out: dict[str, npt.NDArray[Any]] = {}
-    for name in ("system", "mode3a", "icao24"):
-        out[name] = np.array([str(v or "") for v in tracks[name].to_pylist()], "U32")
-    for name in _FOREIGN:
-        out[name] = np.asarray(tracks[name].to_numpy(zero_copy_only=False), np.float64)
-    return out

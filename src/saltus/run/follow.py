@@ -79,11 +79,11 @@ def follow(
             now = float(newest[stop - 1])
             session.feed(plots.take(slice(start, stop)), _between(tracks, start, stop, newest))
             bar.working("tracking", stop / len(plots))
-            due = np.isfinite(now) and now >= saved + feeding.every
-            if feeding.folder is not None and (due or interrupted()) and stop < len(plots):
+            due, stopped = np.isfinite(now) and now >= saved + feeding.every, interrupted()
+            if feeding.folder is not None and (stopped or (due and stop < len(plots))):
                 session.save(feeding.folder, {"inputs": told, "time": now})
                 saved = now
-            if interrupted():
+            if stopped:
                 raise KeyboardInterrupt(f"the state is saved in {feeding.folder}; go on from there with --resume")
     return session.finish(), lines
 
@@ -104,7 +104,7 @@ def _session(
     folder = feeding.folder
     if feeding.resume and folder is not None and has_checkpoint(folder):
         session = Session.restore(folder, bar)
-        changed = _changed(session.notes["inputs"], told)
+        changed = _changed(session.notes.get("inputs", {}), told)
         if changed:
             raise DataError(
                 f"{folder}: the state saved there is of another run: changed since are {', '.join(changed)}. Give "
