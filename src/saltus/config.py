@@ -43,11 +43,13 @@ from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
+from saltus import io
 from saltus.asterix.layout import editions as known_editions
 from saltus.errors import ModelError
 from saltus.framing import NAMES
 from saltus.io.settings import ReadingSettings
-from saltus.records import System
+from saltus.io.told import Progress
+from saltus.records import Recording, System
 from saltus.text import brief, cut, shown
 from saltus.toml import load_toml
 from saltus.tracks.settings import FilterSettings, RegistrationSettings, SetupSettings, SystemsSettings, TrackerSettings
@@ -153,6 +155,18 @@ class Config(BaseModel):
     systems: SystemsSettings = Field(default_factory=SystemsSettings)
     registration: RegistrationSettings = Field(default_factory=RegistrationSettings)
     learnt: Learnt | None = None
+
+    def read(self, inputs: Sequence[Path | str], progress: Progress | None = None) -> Recording:
+        """Read recordings as the configuration says (`saltus.io.read`)."""
+        return io.read(
+            inputs,
+            date=self.date,
+            editions=self.editions,
+            framing=self.framing,
+            progress=progress,
+            settings=self.reading,
+            apart=self.apart,
+        )
 
     def site_for(self, system: System) -> SensorConfig | None:
         """The sensor of a system; one that names channel or category goes before one that does not."""

@@ -7,7 +7,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus import io
 from saltus.config import Config
 from saltus.errors import DataError
 from saltus.geo import Site
@@ -73,16 +72,7 @@ def from_recordings(
     Raises:
         DataError: a file cannot be read, a site is not configured, no address occurs in both, or both say the same.
     """
-    seen, truth = (
-        io.read(
-            list(paths),
-            date=config.date,
-            editions=config.editions,
-            framing=config.framing,
-            settings=config.reading,
-        ).plots
-        for paths in (inputs, reference)
-    )
+    seen, truth = (config.read(paths).plots for paths in (inputs, reference))
     if phase != "all":
         seen = seen.take(seen.on_ground == (1 if phase == "ground" else 0))
     both = Plots.concat([seen, truth])

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from saltus import io
 from saltus.config import Config, load_config
 from saltus.demo import write_demo
 from saltus.errors import ModelError
@@ -64,9 +63,7 @@ def study_faults(
     with output_directory(output, "study") as folder:
         if recordings:
             config = load_config(config_path, date=date, framing=framing)
-            recording = io.read(
-                recordings, date=config.date, editions=config.editions, framing=config.framing, settings=config.reading
-            )
+            recording = config.read(recordings)
             truth = None if reference is None else downlinked(recording.plots, reference)
         else:
             recording, config, truth = _scene(folder, seed)
@@ -87,7 +84,7 @@ def _scene(folder: Path, seed: int) -> tuple[Recording, Config, Motion]:
     """Simulate in a folder of its own within `folder`, so that a kill leaves nothing elsewhere."""
     scene = write_demo(folder / "scene", seed)
     config = load_config(scene.config)
-    recording = io.read(scene.files, date=config.date, editions=config.editions)
+    recording = config.read(scene.files)
     truth = read_reference(scene.config.with_name("truth.parquet"))
     shutil.rmtree(folder / "scene")
     files = {path.name: labels for path, labels in zip(scene.files, scene.labels, strict=True)}

@@ -5,15 +5,10 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import pyarrow as pa
 
-from saltus import io
 from saltus.config import Config, load_config
 from saltus.engine import Result
-from saltus.engine.learn import usable
-from saltus.engine.setup import site_of
-from saltus.errors import DataError
 from saltus.io.inputs import expand
 from saltus.io.write import output_directory, write_json, write_table
 from saltus.progress import Progress, progress_bar
@@ -26,7 +21,7 @@ from saltus.run.identified import (
     system_lines,
     systems_found,
 )
-from saltus.run.problems import called, nothing_left, set_up, site_wanted, without_tracks
+from saltus.run.problems import called, refuse_unusable, set_up, without_tracks
 from saltus.run.window import windowed
 from saltus.summary import health_of, noise_rows, show_summary, summarise, why_no_track
 
@@ -112,15 +107,7 @@ def write_tracks(
     """
     began = time.perf_counter()
     config = load_config(given.config, date=given.date, framing=given.framing)
-    recording = io.read(
-        inputs,
-        date=config.date,
-        editions=config.editions,
-        framing=config.framing,
-        progress=bar.reading,
-        settings=config.reading,
-        apart=config.apart,
-    )
+    recording = config.read(inputs, bar.reading)
     decoded = time.perf_counter()
     recording = replace(recording, plots=windowed(recording.plots, given.time_from, given.time_to))
     told = _told(inputs, given) if given.feeding.folder is not None else {}
@@ -178,15 +165,7 @@ def _followed(
     use_identity: bool,
 ) -> tuple[Result, list[str]]:
     """Track a recording, if anything in it can be."""
-    plots = recording.plots
-    sites = [site_of(config.site_for(s.system)) for s in plots.sources]
-    good = usable(plots, sites)
-    if not good.any():
-        lost = (plots.reason == 0) & ~good
-        count = np.bincount(plots.source[lost], minlength=len(plots.sources)) if len(plots) else np.zeros(0, int)
-        wanted = [site_wanted(source, int(n)) for source, n in zip(plots.sources, count, strict=True) if n]
-        reason = np.where(lost, _SITE_UNKNOWN, plots.reason).astype(np.int8)
-        raise DataError(nothing_left(replace(plots, reason=reason), [*recording.problems, *wanted]))
+    refuse_unusable(recording, config)
     return follow(recording, config, bar, feeding, told, use_identity=use_identity)
 
 

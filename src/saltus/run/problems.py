@@ -1,15 +1,19 @@
 """Lines for people on what a run could not do, and how to mend it."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from saltus.config import Config
 from saltus.engine import Result, Setup
-from saltus.engine.learn import sigmas
-from saltus.records import REASONS, Plots, Source
+from saltus.engine.learn import sigmas, usable
+from saltus.engine.setup import site_of
+from saltus.errors import DataError
+from saltus.records import REASONS, Plots, Recording, Source
 from saltus.times import utc
 
-__all__ = ["called", "nothing_left", "set_up", "without_tracks"]
+__all__ = ["called", "refuse_unusable", "set_up", "without_tracks"]
 
 _MANY = 100  # positions of a source that should have made a track
 _SITE_UNKNOWN = REASONS.index("site unknown")
@@ -25,7 +29,7 @@ def set_up(setup: Setup, unplaced: Mapping[int, int]) -> list[str]:
     lines = []
     for s, sensor in enumerate(setup.sensors):
         if unplaced.get(s):
-            lines.append(site_wanted(sensor.source, unplaced[s]))
+            lines.append(_site_wanted(sensor.source, unplaced[s]))
         if np.isfinite(sensor.appeared) and set(field for _, field, _ in sigmas(sensor)) - set(sensor.given):
             used = ", ".join(f"{label} {getattr(sensor.noise, f) * unit:.4g}" for label, f, unit in sigmas(sensor))
             lines.append(
@@ -41,7 +45,7 @@ def set_up(setup: Setup, unplaced: Mapping[int, int]) -> list[str]:
     return lines
 
 
-def site_wanted(source: Source, count: int) -> str:
+def _site_wanted(source: Source, count: int) -> str:
     """Say that a source's site must be configured."""
     system = source.system
     keys = f"sac = {system.sac}, sic = {system.sic}" if system.category is not None else f'name = "{system.name}"'
@@ -75,7 +79,24 @@ def called(setup: Setup) -> dict[str, str]:
     return names
 
 
-def nothing_left(plots: Plots, problems: Sequence[str]) -> str:
+def refuse_unusable(recording: Recording, config: Config) -> None:
+    """Refuse a recording of which nothing can be tracked.
+
+    Raises:
+        DataError: there is no usable report, or each is relative to a site not configured.
+    """
+    plots = recording.plots
+    sites = [site_of(config.site_for(s.system)) for s in plots.sources]
+    good = usable(plots, sites)
+    if not good.any():
+        lost = (plots.reason == 0) & ~good
+        count = np.bincount(plots.source[lost], minlength=len(plots.sources)) if len(plots) else np.zeros(0, int)
+        wanted = [_site_wanted(source, int(n)) for source, n in zip(plots.sources, count, strict=True) if n]
+        reason = np.where(lost, _SITE_UNKNOWN, plots.reason).astype(np.int8)
+        raise DataError(_nothing_left(replace(plots, reason=reason), [*recording.problems, *wanted]))
+
+
+def _nothing_left(plots: Plots, problems: Sequence[str]) -> str:
     """Say why none of the reports can be tracked."""
     if not len(plots):
         return "the inputs hold no target report. " + " ".join(problems)

@@ -5,14 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from saltus import io
 from saltus.config import load_config
 from saltus.engine import SensorSetup, Session, Setup
 from saltus.engine.learn import sigmas
 from saltus.engine.saved import setup_toml
+from saltus.errors import DataError
 from saltus.io.write import output_file, write_text
 from saltus.progress import progress_bar
 from saltus.run.follow import told_periods
+from saltus.run.problems import refuse_unusable
 from saltus.text import say, shown
 
 __all__ = ["setup_files"]
@@ -40,19 +41,15 @@ def setup_files(
         framing: of ASTERIX recordings.
 
     Raises:
-        DataError: an input cannot be read, or no report can be placed.
+        DataError: an input cannot be read, no report can be placed, or the output is one of the inputs.
         ModelError: the configuration is wrong.
     """
+    if output.exists() and any(output.samefile(p) for p in (*inputs, config_path) if p is not None and p.exists()):
+        raise DataError(f"{output}: would be overwritten, and is what the setup is made of. Give another -o.")
     with progress_bar() as bar, output_file(output) as path:
         config = load_config(config_path, date=date, framing=framing).model_copy(update={"learnt": None})
-        recording = io.read(
-            inputs,
-            date=config.date,
-            editions=config.editions,
-            framing=config.framing,
-            progress=bar.reading,
-            settings=config.reading,
-        )
+        recording = config.read(inputs, bar.reading)
+        refuse_unusable(recording, config)
         session = Session.open(
             config, use_identity=identity == "use", periods=told_periods(recording), hold=0.0, bar=bar
         )
@@ -66,7 +63,8 @@ def setup_files(
         say(f"note: {problem}")
     for sensor in setup.sensors:
         say(_line(sensor))
-    say(f"written to {shown(str(output))}; saltus track reads it with --config")
+    undated = "" if config.date is None else f", with --date {config.date} for these recordings: it holds no date"
+    say(f"written to {shown(str(output))}; saltus track reads it with --config{undated}")
     return setup
 
 
