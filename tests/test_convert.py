@@ -143,7 +143,10 @@ def test_what_cannot_be(radar, tmp_path):
         ((path, "-o", tmp_path / "x.csv", "--items", "999"), "--items 999: no category of these recordings has it"),
         ((tmp_path / "t.csv", "-o", tmp_path / "x.csv"), "is a table already"),
         ((tmp_path / "no.ast", "-o", tmp_path / "x.csv"), "no record could be read"),
-        ((path, "-o", tmp_path / "x.csv", "--from", "12:00"), "outside time window"),
+        (
+            (path, "-o", tmp_path / "x.csv", "--from", "12:00"),
+            "outside time window from 1970-01-02 12:00:00: the recording",
+        ),
         ((path, "-o", tmp_path / "x.csv", "--framing", "tar"), "framing 'tar' is not known; choose one of plain"),
     ):
         result = convert(*arguments)

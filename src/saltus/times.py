@@ -38,8 +38,11 @@ def time_window(time_from: str | None, time_to: str | None, start: float, end: f
     if first > last and time_from is not None and time_to is not None:
         raise DataError(f"--from {time_from} is after --to {time_to}: {utc(first)} and {utc(last)} (UTC).")
     if first > last or first > end or last < start:
+        window = " ".join(
+            [f"from {utc(first)}"] * (time_from is not None) + [f"to {utc(last)}"] * (time_to is not None)
+        )
         raise DataError(
-            f"every report is outside time window {utc(first)} to {utc(last)}: the recording lasts from "
+            f"every report is outside time window {window}: the recording lasts from "
             f"{utc(start)} to {utc(end)} (UTC). Give --from and --to inside it, as HH:MM:SS or 2023-05-02T08:00:00."
         )
     return first, last

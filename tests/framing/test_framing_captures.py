@@ -210,3 +210,10 @@ def test_dated_by_the_capture():
     (chunk,) = [*framer.feed(pcap([ethernet(ipv4(udp(b))) for b in BODIES])), *framer.finish()]
     assert chunk.dated
     assert chunk.channel.tolist() == [0] * len(BODIES)
+
+
+def test_a_capture_cut_within_a_packet_says_so(using):
+    got, told = frame(pcap([ethernet(ipv4(udp(b))) for b in BODIES])[:-5], using=using)
+    assert bodies(got) == BODIES[:-1]
+    (problem,) = told.problems
+    assert "no whole packet, and none follows" in problem

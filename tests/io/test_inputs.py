@@ -1,11 +1,13 @@
 """Directories and patterns as inputs."""
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from frames import NORTH, PLOT, plot
 
 from saltus.errors import DataError
 from saltus.io import read
-from saltus.io.inputs import expand
+from saltus.io.inputs import expand, left_out
 
 
 @pytest.fixture
@@ -33,6 +35,20 @@ def test_a_directory_stands_for_its_recordings(folder):
     names = [str(p.relative_to(folder)) for p in expand([folder])]
     assert names == ["a.ast", "b/c.bin", "b/d.csv"]
     assert read([folder / "b", folder / "a.ast"]).plots.files == ("c.bin", "d.csv", "a.ast")
+
+
+def test_what_a_directory_leaves_out_is_told(folder):
+    table = pa.table({"a": [1.0]}).rename_columns(["caf#"])
+    pq.write_table(table, folder / "odd.parquet")
+    content = (folder / "odd.parquet").read_bytes()
+    (folder / "odd.parquet").write_bytes(content.replace(b"caf#", b"caf\xff"))  # a column's name that is no text
+    said = read([folder]).problems[:2]
+    assert said == tuple(left_out([folder / "a.ast", folder]))
+    assert set(said) == {
+        f"{folder}: not read, tables without a column time: odd.parquet, sites.csv.",
+        f"{folder}: not read, of no format that is known: README.md, empty.ast, sensors.toml.",
+    }
+    assert left_out([folder / "b"]) == []
 
 
 def test_patterns(folder):

@@ -49,12 +49,12 @@ def test_swapped_columns_are_named_where_they_cannot_be(tmp_path):
 
 def test_every_column_that_is_not_used_is_named_and_counted(tmp_path):
     (tmp_path / "t.csv").write_text(
-        "time,x_m,y_m,range_nm,altitude_ft,Lattitude,zzz,squawk\n1,2,3,4,,5,,\n2,2,3,4,3000,5,,1200\n"
+        "time,x_m,y_m,range_nm,altitude_ft,Lattitude,zzz,squawk,mode3a_v\n1,2,3,4,,5,,,1\n2,2,3,4,3000,5,,1200,1\n"
     )
     assert read([tmp_path / "t.csv"]).problems == (
         "t.csv: columns not used: range_nm (2 values; write range_m (1 NM = 1852 m)), altitude_ft (1 values; write "
         "altitude_m (1 ft = 0.3048 m)), Lattitude (2 values; write latitude), zzz (0 values), squawk (1 values; write "
-        "mode3a, four octal digits).",
+        "mode3a, four octal digits), mode3a_v (2 values).",  # says whether a code is valid: no code
     )
 
 

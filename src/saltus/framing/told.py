@@ -73,9 +73,10 @@ class Told:
         self.n_gap_bytes += stop - start
         self._lost += stop - start
         size = stop - start
+        missing = "whole packet" if self._open is not None and self._open[0].startswith("pcap") else "ASTERIX block"
         self.tell(
             "places without ASTERIX blocks",
-            f"byte {start}: no ASTERIX block, and none follows; the last {size} bytes are not used."
+            f"byte {start}: no {missing}, and none follows; the last {size} bytes are not used."
             if last
             else f"byte {start}: no ASTERIX block; skipped {size} bytes to the next one.",
         )

@@ -19,7 +19,7 @@ from saltus.info.inventory import Inventory, Line
 from saltus.info.skeleton import skeleton
 from saltus.io import Told, format_of, read_part
 from saltus.io.asterix import read_pieces
-from saltus.io.inputs import expand
+from saltus.io.inputs import expand, left_out
 from saltus.io.merge import merge
 from saltus.io.part import Part, printable
 from saltus.records import Contents, FileContents
@@ -83,15 +83,15 @@ def show_info(
         console = Console(highlight=False)
         if not console.is_terminal:
             console = Console(highlight=False, width=_PLAIN_WIDTH)
-        _show(console, inventory, [shown(path.name) for path in paths], config)
+        _show(console, inventory, [shown(path.name) for path in paths], config, left_out(inputs))
     if len(failures) == 1:
         raise next(iter(failures.values()))
     if failures:
         raise DataError("\n".join(failures))
 
 
-def _show(console: Console, inventory: Inventory, files: Sequence[str], config: Config) -> None:
-    """Print all files in the order in which they were given."""
+def _show(console: Console, inventory: Inventory, files: Sequence[str], config: Config, missed: Sequence[str]) -> None:
+    """Print all files in the order in which they were given, and what was not read."""
     for file in dict.fromkeys(files):
         lines = inventory.of_file(file)
         if not lines:
@@ -107,7 +107,7 @@ def _show(console: Console, inventory: Inventory, files: Sequence[str], config: 
     console.print(f"{n} target reports, {usable} usable, {n - usable} rejected")
     if inventory.n_tracks:
         console.print(f"{inventory.n_tracks} reports are another system's tracks: kept apart, never plots")
-    for problem in inventory.problems:
+    for problem in (*missed, *inventory.problems):
         console.print(Text("problem: ", style="yellow") + Text(problem))
 
 

@@ -2,12 +2,13 @@
 
 import datetime
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from saltus.errors import DataError
 from saltus.framing.capture import MAGIC
-from saltus.io.inputs import expand
+from saltus.io.inputs import expand, left_out
 from saltus.io.merge import merge
 from saltus.io.part import Part, printable
 from saltus.io.settings import ReadingSettings
@@ -92,7 +93,8 @@ def read(
     if not paths:
         raise DataError("no input given: name at least one recording.")
     told = Told(date, editions or {}, framing, settings or ReadingSettings(), None, frozenset(apart))
-    return merge([read_part(path, told, progress) for path in expand(paths)])
+    found = merge([read_part(path, told, progress) for path in expand(paths)])
+    return replace(found, problems=(*left_out(paths), *found.problems))
 
 
 def read_in_order(

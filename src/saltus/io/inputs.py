@@ -5,11 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from saltus.errors import DataError
+from saltus.text import shown
 
-__all__ = ["expand"]
+__all__ = ["expand", "left_out"]
 
 _PATTERN = "*?["
 _RESULT = "summary.json"  # marks a folder that a run wrote
+_NAMED = 5  # files left out that are named
 
 
 def expand(inputs: Sequence[Path | str]) -> list[Path]:
@@ -41,11 +43,29 @@ def _matching(pattern: Path) -> list[Path]:
     return files
 
 
-def _below(folder: Path) -> list[Path]:
+def left_out(inputs: Sequence[Path | str]) -> list[str]:
+    """Say of each directory among inputs which files `expand` takes for no recordings, and why."""
+    said = []
+    for folder in (Path(entry) for entry in inputs if Path(entry).is_dir()):
+        reasons: dict[str, list[str]] = {}
+        for path in _files(folder):
+            if why := _no_recording(path):
+                reasons.setdefault(why, []).append(shown(path.name))
+        for why, names in reasons.items():
+            more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+            said.append(f"{shown(str(folder))}: not read, {why}: {', '.join(names[:_NAMED])}{more}.")
+    return said
+
+
+def _files(folder: Path) -> list[Path]:
     paths = sorted(folder.rglob("*"))
     results = {path.parent for path in paths if path.name == _RESULT}
-    files = [p for p in paths if p.is_file() and not _hidden(p.relative_to(folder)) and not results & {*p.parents}]
-    recordings = [path for path in files if _is_recording(path)]
+    return [p for p in paths if p.is_file() and not _hidden(p.relative_to(folder)) and not results & {*p.parents}]
+
+
+def _below(folder: Path) -> list[Path]:
+    files = _files(folder)
+    recordings = [path for path in files if not _no_recording(path)]
     if not recordings:
         raise DataError(f"{folder}: none of its {len(files)} files is a recording; name the files to read.")
     return recordings
@@ -55,17 +75,17 @@ def _hidden(path: Path) -> bool:
     return any(part.startswith(".") for part in path.parts)
 
 
-def _is_recording(path: Path) -> bool:
-    """Whether the content, or a table's columns, are those of a recording."""
+def _no_recording(path: Path) -> str:
+    """Why the content, or a table's columns, are not those of a recording; "" where they are."""
     from saltus.io import format_of
 
     try:
         form = format_of(path)
     except DataError:
-        return False
+        return "of no format that is known"
     if "table" not in form.name:
-        return True
-    return "time" in _columns(path, form.name)
+        return ""
+    return "" if "time" in _columns(path, form.name) else "tables without a column time"
 
 
 def _columns(path: Path, form: str) -> list[str]:
@@ -80,6 +100,6 @@ def _columns(path: Path, form: str) -> list[str]:
     try:
         with path.open("rb") as file:
             names: list[str] = parquet.read_schema(file).names
-    except (pyarrow.ArrowException, OSError):
+    except (pyarrow.ArrowException, OSError, UnicodeDecodeError):  # names of columns may be any bytes
         return []
     return names

@@ -202,7 +202,7 @@ def _need_columns(path: Path, names: Sequence[str]) -> None:
     pairs = [pair for _, pair in _POSITIONS]
     if "time" not in names or not any(set(pair) <= set(names) for pair in pairs):
         wanted = "time" if "time" not in names else "a position: " + ", or ".join(" and ".join(p) for p in pairs)
-        there = ", ".join(cut(name, 40) for name in names[:12]) + (", ..." if len(names) > 12 else "")
+        there = ", ".join(cut(name, 40) for name in names[:40]) + (", ..." if len(names) > 40 else "")
         other = [(name, meaning(name, _COLUMNS)) for name in names if name not in _COLUMNS]
         hints = "".join(f" For {cut(name, 40)} write {hint}." for name, hint in other if hint)
         raise DataError(f"{path}: no column for {wanted}. The columns are: {there}. Names and units are fixed.{hints}")

@@ -33,9 +33,12 @@ _MEANT = {
     "range_km": "range_m (1 km = 1000 m)",
     "range": "range_m, in metres",
     "rho": "range_m, in metres",
+    "rho_m": "range_m",
+    "rho_nm": "range_m (1 NM = 1852 m)",
     "azimuth": "azimuth_deg, in degrees",
     "azimuth_rad": "azimuth_deg (1 rad = 57.29578 degrees)",
     "theta": "azimuth_deg, in degrees",
+    "theta_deg": "azimuth_deg",
     "bearing": "azimuth_deg, in degrees",
     "elevation": "elevation_deg, in degrees",
     "altitude_ft": "altitude_m (1 ft = 0.3048 m)",
@@ -155,7 +158,8 @@ def meaning(column: str, known: Collection[str]) -> str:
     if plain in _MEANT:
         return _MEANT[plain]
     near = [plain] if plain in known else difflib.get_close_matches(plain, list(known), n=1, cutoff=0.85)
-    return near[0] if near else ""
+    about = bool(near) and plain.startswith(f"{near[0]}_")  # mode3a_v is no Mode 3/A code, but whether one is valid
+    return near[0] if near and not about else ""
 
 
 def _told(values: Mapping[str, npt.ArrayLike], name: str) -> _Array:
