@@ -30,7 +30,6 @@ _RUN_FILES = {
     "test_score.py",
     "test_summary.py",
     "test_systems.py",
-    "test_faults.py",
     "test_fuse.py",
     "test_identity.py",
     "test_lifecycle.py",

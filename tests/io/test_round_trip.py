@@ -4,6 +4,8 @@ import csv
 import datetime
 
 import numpy as np
+import pyarrow.parquet as pq
+import pyproj
 import pytest
 
 from saltus.asterix.codec import Column
@@ -216,3 +218,14 @@ def test_sources_are_tracked(tmp_path, category):
     config.write_text(f"date = {DATE}\n[[sensor]]\nsac = 20\nsic = 5\nperiod = 4.0\nsigma_xy = 20.0\n{site}")
     summary = track_files([recording(tmp_path / "a.ast", category)], tmp_path / "out", config, report=False)
     assert summary["tracks"]["confirmed"] == 1
+    rows = pq.read_table(tmp_path / "out" / "tracks.parquet").sort_by("time")
+    here = [rows[name].to_numpy()[-1] for name in ("longitude", "latitude")]
+    earth = pyproj.Geod(ellps="WGS84")
+    if category in (1, 48):  # to the north-east of the site
+        slant = POLAR["RHO"][-1] * 1852.0
+        truth = earth.fwd(2.0, 41.0, 45.0, np.sqrt(slant**2 - (HEIGHT_FT * 0.3048) ** 2))[:2]
+    elif category == 10:
+        truth = earth.fwd(2.0, 41.0, np.degrees(np.arctan2(500.0, 1560.0)), np.hypot(500.0, 1560.0))[:2]
+    else:
+        truth = (WEST, LATITUDE[-1])
+    assert earth.inv(*here, *truth)[2] < 60.0  # m, of 30 km flown and more
