@@ -112,6 +112,8 @@ def test_a_source_that_appears_later_begins_with_its_configuration(config):
     plots = scene(2, seconds=180.0)
     plots = plots.take((plots.source == 0) | (plots.time > 70.0))
     result, _ = fed(config, plots)
+    estimate = result.setup.sensors[1].estimate  # told after the end, from all its tracks: 30 m and 1 mrad are true
+    assert abs(estimate.range - 30.0) < 8.0 and abs(estimate.azimuth - 1e-3) < 3e-4
     versions = Session.open(config)
     versions.feed(plots)
     times = versions.health()["setups"]

@@ -131,6 +131,8 @@ def _kind(source: Source, kinds: npt.NDArray[np.int8]) -> int:
 
 def _with_noise(setup: Setup, plots: Plots, own: Sequence[int], bar: Progress) -> Setup:
     """Estimate the noise of one system's sources from its own tracks, and widen it to what innovations say."""
+    if all(_configured(setup.sensors[s]) for s in own):
+        return setup  # `finish` estimates it from the tracks that it has
     m, _, found = _tracked(setup, plots, own, bar, "estimating noise")
     before = _counted(m, found, len(setup.sensors))
     estimates = {s: estimate_noise(m, found, s) for s in own}
@@ -139,8 +141,6 @@ def _with_noise(setup: Setup, plots: Plots, own: Sequence[int], bar: Progress) -
         noise = replace(apply_estimate(sensors[s].noise, estimates[s], sensors[s].source), **sensors[s].given)
         sensors[s] = replace(sensors[s], noise=noise, estimate=estimates[s])
     estimated = replace(setup, sensors=tuple(sensors))
-    if all(_configured(sensors[s]) for s in own):
-        return estimated
     m, rows, found = _tracked(estimated, plots, own, bar, "checking noise")
     after = _counted(m, found, len(sensors))
     for s in own:

@@ -1,7 +1,7 @@
 """What is known after the end: a function of the journal and the setup."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from saltus.tracks.faults import History, plot_law
 from saltus.tracks.kinematics import Moments
 from saltus.tracks.local import Party
 from saltus.tracks.measurements import Measurements
+from saltus.tracks.noise import estimate_noise
 from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.rows import ConditionFound, Fates, Rows, Tracked, assignments, join_rows
 
@@ -56,6 +57,7 @@ def finished(journal: Journal, setup: Setup, files: Sequence[str], health: dict[
     tracked = {party: t for party in parties if (t := _tracked(journal, setup, party)) is not None}
     foreign = journal.all("foreign")
     whole, joined = together(setup, tracked, plots, None if foreign is None else pa.table(foreign))
+    setup = _with_estimates(setup, tracked)
     tracks, gates = _tables(joined, setup)
     return Result(
         tracks=tracks,
@@ -69,6 +71,17 @@ def finished(journal: Journal, setup: Setup, files: Sequence[str], health: dict[
         tracked=joined,
         whole=whole,
     )
+
+
+def _with_estimates(setup: Setup, tracked: Mapping[Party, Tracked]) -> Setup:
+    """Estimate, to be told, the noise of sources whose noise was not learnt: configured, or they appeared later."""
+    sensors = list(setup.sensors)
+    for party, t in tracked.items():
+        found = t.assignments
+        track = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)
+        for s in (s for s in party.sources if not sensors[s].estimate.n_windows):
+            sensors[s] = replace(sensors[s], estimate=estimate_noise(t.measurements, track, s))
+    return replace(setup, sensors=tuple(sensors))
 
 
 def _reports(journal: Journal, setup: Setup, files: Sequence[str]) -> Plots:
