@@ -67,7 +67,9 @@ def tracked(recording: Path, reference: Path, config: str) -> tuple[dict[str, Ar
     at = np.array([of.get(k, -1) for k in keys(rows, mine)])
     mine, at = mine[at >= 0], at[at >= 0]
     if not len(at):
-        raise SystemExit(f"no update has the address and time of a row of {reference}: is the date of --config another?")
+        raise SystemExit(
+            f"no update has the address and time of a row of {reference}: is the date of --config another?"
+        )
     course = column(rows, "course_deg")[mine] - column(said, "track_deg")[at]
     ((_, noise),) = summary["noise"].items()
     shown = ", ".join(f"{k} {v['used']}" for k, v in noise.items() if k.startswith("sigma"))
