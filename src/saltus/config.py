@@ -37,9 +37,9 @@ import dataclasses
 import datetime
 import difflib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
@@ -53,6 +53,9 @@ from saltus.records import Recording, System
 from saltus.text import brief, cut, shown
 from saltus.toml import load_toml
 from saltus.tracks.settings import FilterSettings, RegistrationSettings, SetupSettings, SystemsSettings, TrackerSettings
+
+if TYPE_CHECKING:
+    from saltus.io.in_order import InOrder
 
 __all__ = ["Config", "SensorConfig", "load_config", "parse_date"]
 
@@ -81,6 +84,7 @@ _HINTS = {
 _YEARS = 1970, 2100  # of a recording: times count from the first, reports after the last are out of range
 _Settings = ReadingSettings | SetupSettings | TrackerSettings | FilterSettings | SystemsSettings | RegistrationSettings
 T = TypeVar("T", bound=_Settings)
+_Read = TypeVar("_Read", Recording, "InOrder")
 _Octet = Annotated[int, Field(ge=0, le=255)]
 _Sigma = Annotated[float, Field(gt=0.0, le=1e4)]
 
@@ -158,7 +162,14 @@ class Config(BaseModel):
 
     def read(self, inputs: Sequence[Path | str], progress: Progress | None = None) -> Recording:
         """Read recordings as the configuration says (`saltus.io.read`)."""
-        return io.read(
+        return self._read(io.read, inputs, progress)
+
+    def read_in_order(self, inputs: Sequence[Path | str], progress: Progress | None = None) -> "InOrder":
+        """Read recordings a chunk at a time as the configuration says (`saltus.io.read_in_order`)."""
+        return self._read(io.read_in_order, inputs, progress)
+
+    def _read(self, how: Callable[..., _Read], inputs: Sequence[Path | str], progress: Progress | None) -> _Read:
+        return how(
             inputs,
             date=self.date,
             editions=self.editions,

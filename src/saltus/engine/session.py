@@ -116,7 +116,8 @@ class Session:
         folder: Path | None,
         bar: Progress,
     ) -> None:
-        self._config, self._use_identity, self._periods, self._hold = config, use_identity, dict(periods), hold
+        self._config, self._use_identity, self._hold = config, use_identity, hold
+        self._periods = dict(periods)
         self._bar, self._journal = bar, Journal(folder)
         self._sources: list[Source] = []
         self._files: list[str] = []
@@ -170,6 +171,13 @@ class Session:
             self._vetting = None
         self._arrived(self._intake.add(plots.take(good), number[good]))
         return self._published()
+
+    def tell_periods(self, periods: Mapping[str, float]) -> None:
+        """Say the update period of each source that its reader tells by now, by designation, s.
+
+        It counts for what is learnt from then on: a first stretch that has not ended, sources that appear later.
+        """
+        self._periods |= periods
 
     def settle(self) -> Setup:
         """Return the setup, learnt from the reports so far if there was none: the first stretch ends.

@@ -1,10 +1,10 @@
 """Recordings in: ASTERIX files, packet captures and tables become target reports as arrays."""
 
 import datetime
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from saltus.errors import DataError
 from saltus.framing.capture import MAGIC
@@ -15,6 +15,9 @@ from saltus.io.settings import ReadingSettings
 from saltus.io.told import Progress, Told
 from saltus.records import Recording
 from saltus.text import brief
+
+if TYPE_CHECKING:
+    from saltus.io.in_order import InOrder
 
 __all__ = ["FORMATS", "Format", "ReadingSettings", "Told", "format_of", "read", "read_in_order", "read_part"]
 
@@ -106,8 +109,10 @@ def read_in_order(
     progress: Progress | None = None,
     settings: ReadingSettings | None = None,
     apart: Iterable[tuple[int, int]] = (),
-) -> Iterator[Recording]:
+) -> "InOrder":
     """Read files and merge them by time as `read` does, a chunk at a time: memory does not grow with them.
+
+    All files are indexed at once, and read when the chunks are asked for.
 
     Clocks are judged as the reports come, and what was given is not taken back: where a clock is set back for good,
     its later reports are right as they are with `read`, but none of the earlier ones is marked for it. A recording
@@ -123,9 +128,10 @@ def read_in_order(
         settings: bounds of reading; reports that wait for others take no more than `memory`.
         apart: SAC and SIC of sources that are told apart by channel.
 
-    Yields:
-        Recordings whose usable reports are in order of time from first to last; rejected ones come with the piece of
-        the file in which they lie. The last has no reports, but contents, problems and files of all.
+    Returns:
+        An iterator of recordings whose usable reports are in order of time from first to last; rejected ones come with
+        the piece of the file in which they lie, with contents of what was read so far and the problems first met. The
+        last has no reports, but contents, problems and files of all. `span` is what the index tells of their times.
 
     Raises:
         DataError: as `read`, or too many reports wait for others that come late.
@@ -139,7 +145,7 @@ def read_in_order(
         table_run(path, k) if "table" in format_of(path, framing).name else asterix_runs(path, k, told, progress)
         for k, path in enumerate(expand(paths))
     ]
-    yield from InOrder(indexed, told.settings.memory)
+    return InOrder(indexed, told.settings.memory)
 
 
 def read_part(path: Path, told: Told, progress: Progress | None = None) -> Part:

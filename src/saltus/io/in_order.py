@@ -1,7 +1,10 @@
 """Recordings in order of time, a chunk at a time: memory does not grow with them.
 
-    for recording in read_in_order([...]):
+    pieces = read_in_order([...])
+    pieces.span                              s, UTC: what the index of all files tells of their times
+    for recording in pieces:
         recording.plots                      the next reports, none older than those of the chunk before
+        recording.contents, problems         of what was read so far, and first met in this chunk
     recording.contents, problems, files      of everything, in the last chunk, which has no reports
 
 Every ASTERIX file is indexed first (`saltus.io.index`): its stretches in order of time are then read side by side, each
@@ -70,7 +73,7 @@ class Indexed:
     """What the index of one file tells."""
 
     name: str
-    span: tuple[float, float]  # s, UTC
+    span: tuple[float, float]  # s, UTC, NaN where it tells no times
     plain: bool  # it tells no date
     runs: list[Run]
     problems: list[str] = field(default_factory=list)
@@ -124,7 +127,8 @@ def table_run(path: Path, number: int) -> Indexed:
             lag = max(lag, float((before - told).max(initial=0.0, where=np.isfinite(before))))
             start, newest = min(start, float(told.min())), max(newest, float(told.max()))
     run = Run(number, read_table_pieces(path), start if np.isfinite(start) else -np.inf, lag)
-    return Indexed(path.name, (np.nan, np.nan), False, [run])
+    span = (start, newest) if np.isfinite(start) else (np.nan, np.nan)
+    return Indexed(path.name, span, False, [run])
 
 
 def _day(time: float) -> datetime.date:
@@ -169,17 +173,24 @@ class InOrder:
         self._rejected: dict[tuple[int, System], Counter[int]] = {}
         self._spans: dict[tuple[int, System], tuple[float, float]] = {}
 
+    @property
+    def span(self) -> tuple[float, float]:
+        """First and last time that the index of the files tells, s, UTC; NaN where it tells none."""
+        spans = [np.add(f.span, DAY if k in self._later else 0.0) for k, f in enumerate(self._files)]
+        told = np.array([s for s in spans if np.isfinite(s).all()]).reshape(-1, 2)
+        return (float(told[:, 0].min()), float(told[:, 1].max())) if len(told) else (np.nan, np.nan)
+
     def __iter__(self) -> Iterator[Recording]:
         """Yield the reports in chunks, and last what was read."""
         while open_runs := [run for run in self._runs if not run.done]:
             run = min(open_runs, key=lambda r: r.horizon)
-            part = self._next(run)
+            part, before = self._next(run), len(self._problems)
             plots = None if part is None else self._taken(run, part)
             ready = self._release(min(r.horizon for r in self._runs))
             some = [p for p in (plots, *ready) if p is not None and len(p)]
             tracks = None if part is None else part.tracks
             if some or tracks is not None:
-                yield self._chunk(some, tracks)
+                yield self._chunk(some, tracks, list(self._problems)[before:])
         yield self._last()
 
     def _next(self, run: Run) -> Part | None:
@@ -237,7 +248,7 @@ class InOrder:
         self._held, self._released = rest, max(self._released, horizon)
         return ready
 
-    def _chunk(self, some: list[Plots], tracks: pa.Table | None) -> Recording:
+    def _chunk(self, some: list[Plots], tracks: pa.Table | None, problems: list[str]) -> Recording:
         """Sort reports; of those that came from several runs some are duplicates."""
         plots = Plots.concat(some, same_files=True) if some else Plots.build(0, (), self._names, {})
         plots = plots.sorted_by_time()
@@ -249,7 +260,8 @@ class InOrder:
             if len(times):
                 low, high = self._spans.get(key, (np.inf, -np.inf))
                 self._spans[key] = min(low, float(times.min())), max(high, float(times.max()))
-        return Recording(plots, None if tracks is None else tracks.sort_by("time"), (), ())
+        lines = tuple(line for tally in self._tallies for line in tally.lines())
+        return Recording(plots, None if tracks is None else tracks.sort_by("time"), lines, tuple(problems))
 
     def _by_source(self, plots: Plots) -> Iterator[tuple[tuple[int, System], Plots]]:
         for file in np.unique(plots.file).tolist():

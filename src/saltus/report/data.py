@@ -28,7 +28,7 @@ _OUTSIDE = REASONS.index("outside time window")
 def payload(
     updates: Updates,
     plots: Plots,
-    assignments: "pa.Table",
+    track_id: npt.NDArray[np.float64],
     innovations: "pa.Table",
     sites: Mapping[str, "Site"],
     names: Mapping[str, str],
@@ -42,7 +42,7 @@ def payload(
     plane = plane_about(plots, position, updates.table, sites)
     placed = [(names.get(key, key), site) for key, site in sites.items() if np.isfinite(site.latitude)]
     t0, t1 = time_span(plots, updates) or (0.0, 0.0)
-    on_plots, plot_notes = _plots(plots, position, updates, assigned_tracks(plots, assignments), plane, t0)
+    on_plots, plot_notes = _plots(plots, position, updates, track_id, plane, t0)
     on_tracks, track_notes = _tracks(updates, innovations, plane, t0)
     on_plots["sources"] = [names.get(str(s.system), str(s.system)) for s in plots.sources]
     drawn = {
@@ -86,8 +86,12 @@ def time_span(plots: Plots, updates: Updates) -> tuple[float, float] | None:
     return None
 
 
-def assigned_tracks(plots: Plots, assignments: "pa.Table") -> npt.NDArray[np.float64]:
-    """Return each plot's track id, NaN for none: matched by file, category and record."""
+def assigned_tracks(
+    plots: Plots, assignments: "pa.Table", number: npt.NDArray[np.int64] | None = None
+) -> npt.NDArray[np.float64]:
+    """Return each plot's track id, NaN for none: of the rows given, else matched by file, category and record."""
+    if number is not None:
+        return numbers(assignments.select(["track_id"]), "track_id")[number]
     ids, record = numbers(assignments, "track_id"), numbers(assignments, "record")
     time = numbers(assignments, "time")
     if np.array_equal(record, plots.record) and np.array_equal(time, plots.time, equal_nan=True):

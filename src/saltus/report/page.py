@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from saltus.io.write import output_file, write_text
 from saltus.records import Plots, System
 from saltus.report.colours import HEIGHT_ENDS, PROBABILITY_ENDS, colour_map
-from saltus.report.data import payload, rows_within, time_span
+from saltus.report.data import assigned_tracks, payload, rows_within, time_span
 from saltus.report.section import systems_section
 from saltus.report.sensors import HEIGHT, WIDTH, sensor_rows
 from saltus.report.settings import readable
@@ -42,6 +43,7 @@ def write_report(
     tracks: "pa.Table",
     plots: Plots,
     assignments: "pa.Table",
+    number: npt.NDArray[np.int64] | None = None,
     innovations: "pa.Table",
     summary: Mapping[str, object],
     sites: Mapping[str, "Site"],
@@ -54,8 +56,9 @@ def write_report(
     Args:
         path: file to write.
         tracks: the columns of `tracks.parquet`, any order of rows.
-        plots: every target report read, rejected ones included.
-        assignments: the columns of `assignments.parquet`; matched with `plots` by file, category and record.
+        plots: target reports read, rejected ones included: all, or every so many-th to be drawn.
+        assignments: the columns of `assignments.parquet`, of all reports.
+        number: row of `assignments` of each of `plots`; None: they are matched by file, category and record.
         innovations: one row per update: `track_id`, `time`, `source` (text), centre of the gate `latitude`,
             `longitude` (degrees), its three-sigma half widths `gate_e`, `gate_n` (m, east and north), `nis`, `dof`.
         summary: what `summary.json` holds. `inputs` (file names), `noise` (per source) and `problems` (lines) have
@@ -70,7 +73,10 @@ def write_report(
     """
     updates = read_updates(rows_within(tracks, plots))
     names = names or {}
-    drawn, notes = payload(updates, plots, assignments, innovations, sites, names)
+    track_id = assigned_tracks(plots, assignments, number)
+    drawn, notes = payload(updates, plots, track_id, innovations, sites, names)
+    if len(plots) < assignments.num_rows:
+        notes.insert(0, f"For the picture, {show(len(plots))} of {show(assignments.num_rows)} reports are kept.")
     jumping, busiest = groups(updates.rows)
     drawn |= {
         "colours": {"p": colour_map(PROBABILITY_ENDS), "height": colour_map(HEIGHT_ENDS)},

@@ -1,7 +1,7 @@
 """`saltus track`: recordings in, tracks, assignments, summary and report out."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -9,10 +9,10 @@ import pyarrow as pa
 
 from saltus.config import Config, load_config
 from saltus.engine import Result
-from saltus.io.inputs import expand
+from saltus.io.inputs import expand, left_out
 from saltus.io.write import output_directory, write_json, write_table
 from saltus.progress import Progress, progress_bar
-from saltus.records import REASONS, Plots, Recording
+from saltus.records import Plots, Recording
 from saltus.run.follow import Feeding, fingerprint, follow
 from saltus.run.identified import (
     address_lines,
@@ -21,14 +21,14 @@ from saltus.run.identified import (
     system_lines,
     systems_found,
 )
-from saltus.run.problems import called, refuse_unusable, set_up, without_tracks
-from saltus.run.window import windowed
+from saltus.run.problems import called, set_up, without_tracks
+from saltus.run.seen import Seen
+from saltus.run.window import Window
 from saltus.summary import health_of, noise_rows, show_summary, summarise, why_no_track
 
 __all__ = ["Options", "track_files", "track_recording", "write_tracks"]
 
 _REPORT = "report.html"
-_SITE_UNKNOWN = REASONS.index("site unknown")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,34 +107,47 @@ def write_tracks(
     """
     began = time.perf_counter()
     config = load_config(given.config, date=given.date, framing=given.framing)
-    recording = config.read(inputs, bar.reading)
-    decoded = time.perf_counter()
-    recording = replace(recording, plots=windowed(recording.plots, given.time_from, given.time_to))
     told = _told(inputs, given) if given.feeding.folder is not None else {}
+    pieces = config.read_in_order(inputs, bar.reading)
+    window, reading = Window.told(given.time_from, given.time_to, pieces.span), _Reading(time.perf_counter() - began)
     use_identity = given.identity == "use"
-    result, lines = _followed(recording, config, bar, given.feeding, told, use_identity=use_identity)
+    result, seen, lines = follow(
+        map(window.marked, reading.of(pieces)),
+        config,
+        bar,
+        given.feeding,
+        told,
+        use_identity=use_identity,
+        span=pieces.span,
+    )
     done = time.perf_counter()
-    names, whole = called(result.setup), result.whole
-    unplaced = _unplaced(result, recording.plots)
-    problems = [
-        *recording.problems,
-        *lines,
-        *set_up(result.setup, unplaced),
-        *(without_tracks(result) if len(result.tracked.assignments.confirmed) else [why_no_track(result)]),
-        *address_lines(whole, names),
-        *conflict_lines(whole, names),
-    ]
-    summary = summarise(inputs, result, problems)
-    summary["systems"] = identification_summary(whole)
+    summary, names = _summary(inputs, result, [*left_out(inputs), *seen.problems, *lines], seen), called(result.setup)
     summary["settings"] = {
         "identity": given.identity,
         **{name: asdict(getattr(config, name)) for name in ("setup", "tracker", "filter", "systems", "registration")},
     }
-    summary["seconds"] = {"decoding": round(decoded - began, 2), "tracking": round(done - decoded, 2)}
+    summary["seconds"] = {
+        "decoding": round(reading.seconds, 2),
+        "tracking": round(done - began - reading.seconds, 2),
+    }
     _write(folder, result, summary)
     if given.report:
-        _report(folder / _REPORT, recording.plots, result, summary)
-    return summary, system_lines(whole, names)
+        _report(folder / _REPORT, seen, result, summary)
+    return summary, system_lines(result.whole, names)
+
+
+def _summary(inputs: Sequence[Path], result: Result, lines: Sequence[str], seen: Seen) -> dict[str, object]:
+    """Sum up a run; `lines` are of its reading."""
+    names, whole = called(result.setup), result.whole
+    found = len(result.tracked.assignments.confirmed)
+    problems = [
+        *lines,
+        *set_up(result.setup, seen.unplaced),
+        *(without_tracks(result) if found else [why_no_track(result)]),
+        *address_lines(whole, names),
+        *conflict_lines(whole, names),
+    ]
+    return {**summarise(inputs, result, problems), "systems": identification_summary(whole)}
 
 
 def track_recording(
@@ -151,22 +164,22 @@ def track_recording(
         The reports with the reasons why some are not used; the columns of `tracks.parquet`; those of
         `assignments.parquet`, one row for each report in the same order.
     """
-    result, _ = _followed(recording, config, bar or Progress(), Feeding(), {}, use_identity=True)
+    result = follow([recording], config, bar or Progress()).result
     return replace(recording.plots, reason=result.reason), result.tracks, result.assignments
 
 
-def _followed(
-    recording: Recording,
-    config: Config,
-    bar: Progress,
-    feeding: Feeding,
-    told: dict[str, object],
-    *,
-    use_identity: bool,
-) -> tuple[Result, list[str]]:
-    """Track a recording, if anything in it can be."""
-    refuse_unusable(recording, config)
-    return follow(recording, config, bar, feeding, told, use_identity=use_identity)
+@dataclass(slots=True)
+class _Reading:
+    """How long the pieces of a recording took to read, s."""
+
+    seconds: float
+
+    def of(self, pieces: Iterable[Recording]) -> Iterator[Recording]:
+        began = time.perf_counter()
+        for piece in pieces:
+            self.seconds += time.perf_counter() - began
+            yield piece
+            began = time.perf_counter()
 
 
 def _told(inputs: Sequence[Path], given: Options) -> dict[str, object]:
@@ -176,26 +189,17 @@ def _told(inputs: Sequence[Path], given: Options) -> dict[str, object]:
     return {"inputs": fingerprint(expand(inputs)), "--config": config, **options, "--framing": given.framing}
 
 
-def _unplaced(result: Result, plots: Plots) -> dict[int, int]:
-    """Number of reports of each source that are relative to a site not known."""
-    systems = [sensor.source.system for sensor in result.setup.sensors]
-    out: dict[int, int] = {}
-    lost = plots.source[result.reason == _SITE_UNKNOWN]
-    for s, source in enumerate(plots.sources):
-        if source.system in systems:
-            out[systems.index(source.system)] = int((lost == s).sum())
-    return out
-
-
-def _report(path: Path, plots: Plots, result: Result, summary: dict[str, object]) -> None:
+def _report(path: Path, seen: Seen, result: Result, summary: dict[str, object]) -> None:
     from saltus.report import write_report
 
     names, sensors = called(result.setup), result.setup.sensors
+    plots, number = seen.sample()
     write_report(
         path,
         tracks=result.tracks,
-        plots=replace(plots, reason=result.reason),
+        plots=replace(plots, reason=result.reason[number]),
         assignments=result.assignments,
+        number=number,
         innovations=result.gates,
         summary={**summary, "noise": noise_rows(summary)},
         sites={str(s.source.system): s.site for s in sensors if s.site is not None},

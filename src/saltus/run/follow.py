@@ -3,14 +3,14 @@
 import hashlib
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from saltus.config import Config
@@ -18,9 +18,11 @@ from saltus.engine import Result, Session
 from saltus.engine.checkpoint import begin_anew, has_checkpoint
 from saltus.errors import DataError
 from saltus.progress import Progress
-from saltus.records import Recording
+from saltus.records import Contents, Plots, Recording
+from saltus.run.problems import refuse_unusable
+from saltus.run.seen import Seen
 
-__all__ = ["Feeding", "fingerprint", "follow", "told_periods"]
+__all__ = ["Feeding", "Followed", "fingerprint", "follow", "told_periods"]
 
 _CHUNK, _OFTEN = 50_000, 1_000  # reports fed at a time, and where states are saved in between
 
@@ -41,51 +43,72 @@ class Feeding:
     every: float = 600.0
     resume: bool = False
 
+    @property
+    def size(self) -> int:
+        """Reports fed at a time, at most."""
+        return self.chunk or (_CHUNK if self.folder is None else _OFTEN)
+
+
+class Followed(NamedTuple):
+    """What became of a recording."""
+
+    result: Result
+    seen: Seen
+    lines: list[str]  # on how it came about
+
 
 def follow(
-    recording: Recording,
+    pieces: Iterable[Recording],
     config: Config,
     bar: Progress,
     feeding: Feeding | None = None,
     told: Mapping[str, Any] | None = None,
     *,
     use_identity: bool = True,
-) -> tuple[Result, list[str]]:
+    span: tuple[float, float] = (np.nan, np.nan),
+) -> Followed:
     """Track a recording.
 
     Args:
-        recording: reports in order of time, all usable or marked.
+        pieces: of it, reports in order of time from first to last, all usable or marked; a whole recording is one.
         config: what is configured.
         bar: shows progress.
         feeding: in which pieces, and whether states are saved.
         told: what must be the same where a run is taken up again.
         use_identity: whether addresses and codes count.
-
-    Returns:
-        The result, and lines on how it came about.
+        span: first and last time of the recording, s, to show how far the run is; NaN: not known.
 
     Raises:
         DataError: nothing can be tracked, or the state saved is of other inputs.
     """
     feeding, told = feeding or Feeding(), dict(told or {})
-    session, lines = _session(recording, config, bar, feeding, told, use_identity=use_identity)
-    plots, tracks = recording.plots, _by_time(recording.tracks)
-    newest = np.maximum.accumulate(np.where(plots.reason == 0, plots.time, -np.inf))
-    chunk = feeding.chunk or (_CHUNK if feeding.folder is None else _OFTEN)
-    begin, saved = session.reports, session.notes.get("time", -np.inf)
+    session, lines = _session(config, bar, feeding, told, use_identity=use_identity)
+    seen, foreign = Seen(config), _Foreign()
+    begin, saved, newest = session.reports, session.notes.get("time", -np.inf), -np.inf
     with _interruptible(feeding.folder is not None) as interrupted:
-        for start in range(begin, len(plots), chunk):
-            stop = min(start + chunk, len(plots))
-            now = float(newest[stop - 1])
-            session.feed(plots.take(slice(start, stop)), _between(tracks, start, stop, newest))
-            bar.working("tracking", stop / len(plots))
-            due, stopped = np.isfinite(now) and now >= saved + feeding.every, interrupted()
-            if feeding.folder is not None and (stopped or (due and stop < len(plots))):
-                session.save(feeding.folder, {"inputs": told, "time": now})
-                saved = now
-            if stopped:
-                raise KeyboardInterrupt(f"the state is saved in {feeding.folder}; go on from there with --resume")
-    return session.finish(), lines
+        for piece in pieces:
+            before, plots = seen.n, piece.plots
+            seen.add(piece)
+            foreign.add(piece.tracks)
+            session.tell_periods(told_periods(seen.contents))
+            for start, stop in _cuts(len(plots), feeding.size, begin - before):
+                newest = max(
+                    newest, float(plots.time[start:stop].max(where=plots.reason[start:stop] == 0, initial=-np.inf))
+                )
+                tracks = foreign.until(newest)
+                if before + stop <= begin:
+                    continue  # fed before the state was saved
+                session.feed(plots.take(slice(start, stop)), tracks)
+                bar.working("tracking", _share(newest, span))
+                due, stopped = np.isfinite(newest) and newest >= saved + feeding.every, interrupted()
+                if feeding.folder is not None and (stopped or due):
+                    session.save(feeding.folder, {"inputs": told, "time": newest})
+                    saved = newest
+                if stopped:
+                    raise KeyboardInterrupt(f"the state is saved in {feeding.folder}; go on from there with --resume")
+    refuse_unusable(seen)
+    session.feed(Plots.build(0, (), (), {}), foreign.until(np.inf))
+    return Followed(session.finish(), seen, lines)
 
 
 def fingerprint(paths: Sequence[Path]) -> dict[str, str]:
@@ -98,7 +121,7 @@ def fingerprint(paths: Sequence[Path]) -> dict[str, str]:
 
 
 def _session(
-    recording: Recording, config: Config, bar: Progress, feeding: Feeding, told: dict[str, Any], *, use_identity: bool
+    config: Config, bar: Progress, feeding: Feeding, told: dict[str, Any], *, use_identity: bool
 ) -> tuple[Session, list[str]]:
     """Open a session, or take one up again."""
     folder = feeding.folder
@@ -116,9 +139,7 @@ def _session(
         begin_anew(folder)
         if feeding.resume:
             lines.append(f"{folder} holds no state yet: begun from the first report.")
-    periods = told_periods(recording)
-    session = Session.open(config, use_identity=use_identity, periods=periods, hold=0.0, folder=folder, bar=bar)
-    return session, lines
+    return Session.open(config, use_identity=use_identity, hold=0.0, folder=folder, bar=bar), lines
 
 
 def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -133,30 +154,47 @@ def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     return out
 
 
-def told_periods(recording: Recording) -> dict[str, float]:
+def told_periods(contents: Sequence[Contents]) -> dict[str, float]:
     """Return the update period of each source that the readers tell, s."""
     found: dict[str, list[float]] = {}
-    for line in recording.contents:
+    for line in contents:
         if np.isfinite(line.update_period) and line.update_period > 0:
             found.setdefault(str(line.system), []).append(line.update_period)
     return {name: float(np.median(told)) for name, told in found.items()}
 
 
-def _by_time(tracks: pa.Table | None) -> pa.Table | None:
-    if tracks is None:
-        return None
-    time = tracks["time"].to_numpy(zero_copy_only=False)
-    return tracks.take(pa.array(np.argsort(time, kind="stable")))
+def _cuts(n: int, size: int, begin: int) -> Iterator[tuple[int, int]]:
+    """Cut `n` reports into pieces of `size`, and at `begin` if that lies among them."""
+    edges = sorted({*range(0, n, size), n, *([begin] if 0 < begin < n else [])})
+    return pairwise(edges)
 
 
-def _between(tracks: pa.Table | None, start: int, stop: int, newest: npt.NDArray[np.float64]) -> pa.Table | None:
-    """Another centre's tracks that came with reports: up to the newest time of these, the last ones with the last."""
-    if tracks is None:
-        return None
-    time = tracks["time"].to_numpy(zero_copy_only=False)
-    low = 0 if start == 0 else int(np.searchsorted(time, newest[start - 1], side="right"))
-    high = len(time) if stop == len(newest) else int(np.searchsorted(time, newest[stop - 1], side="right"))
-    return tracks.slice(low, high - low)
+def _share(now: float, span: tuple[float, float]) -> float:
+    """How far a time lies in a span."""
+    first, last = span
+    return (now - first) / (last - first) if np.isfinite(now) and last > first else 0.0
+
+
+class _Foreign:
+    """Another centre's tracks that wait for the reports of their time."""
+
+    def __init__(self) -> None:
+        self._waiting: pa.Table | None = None
+
+    def add(self, tracks: pa.Table | None) -> None:
+        """Take the tracks that a reader gives, in whatever order."""
+        parts = [t for t in (self._waiting, tracks) if t is not None]
+        if parts:
+            self._waiting = pa.concat_tables(parts).sort_by("time")
+
+    def until(self, now: float) -> pa.Table | None:
+        """Let those up to a time go."""
+        if self._waiting is None:
+            return None
+        time = self._waiting["time"].to_numpy(zero_copy_only=False)
+        n = int(np.searchsorted(time, now, side="right"))
+        ready, self._waiting = self._waiting.slice(0, n), self._waiting.slice(n)
+        return ready
 
 
 @contextmanager

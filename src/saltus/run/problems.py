@@ -1,25 +1,23 @@
 """Lines for people on what a run could not do, and how to mend it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 
-from saltus.config import Config
 from saltus.engine import Result, Setup
-from saltus.engine.learn import sigmas, usable
-from saltus.engine.setup import site_of
+from saltus.engine.learn import sigmas
 from saltus.errors import DataError
-from saltus.records import REASONS, Plots, Recording, Source
+from saltus.records import REASONS, System
+from saltus.run.seen import Seen
 from saltus.times import utc
 
 __all__ = ["called", "refuse_unusable", "set_up", "without_tracks"]
 
 _MANY = 100  # positions of a source that should have made a track
-_SITE_UNKNOWN = REASONS.index("site unknown")
 
 
-def set_up(setup: Setup, unplaced: Mapping[int, int]) -> list[str]:
+def set_up(setup: Setup, unplaced: Mapping[System, int]) -> list[str]:
     """Say what the setup lacks.
 
     Args:
@@ -27,9 +25,9 @@ def set_up(setup: Setup, unplaced: Mapping[int, int]) -> list[str]:
         unplaced: number of reports of each source that are relative to a site not known.
     """
     lines = []
-    for s, sensor in enumerate(setup.sensors):
-        if unplaced.get(s):
-            lines.append(_site_wanted(sensor.source, unplaced[s]))
+    for sensor in setup.sensors:
+        if unplaced.get(sensor.source.system):
+            lines.append(_site_wanted(sensor.source.system, unplaced[sensor.source.system]))
         if np.isfinite(sensor.appeared) and set(field for _, field, _ in sigmas(sensor)) - set(sensor.given):
             used = ", ".join(f"{label} {getattr(sensor.noise, f) * unit:.4g}" for label, f, unit in sigmas(sensor))
             lines.append(
@@ -45,9 +43,8 @@ def set_up(setup: Setup, unplaced: Mapping[int, int]) -> list[str]:
     return lines
 
 
-def _site_wanted(source: Source, count: int) -> str:
+def _site_wanted(system: System, count: int) -> str:
     """Say that a source's site must be configured."""
-    system = source.system
     keys = f"sac = {system.sac}, sic = {system.sic}" if system.category is not None else f'name = "{system.name}"'
     keys += f', channel = "{system.channel}"' if system.channel else ""
     moving = "" if system.category is not None else " A sensor that moves tells its own place: see observer_latitude."
@@ -79,29 +76,22 @@ def called(setup: Setup) -> dict[str, str]:
     return names
 
 
-def refuse_unusable(recording: Recording, config: Config) -> None:
+def refuse_unusable(seen: Seen) -> None:
     """Refuse a recording of which nothing can be tracked.
 
     Raises:
         DataError: there is no usable report, or each is relative to a site not configured.
     """
-    plots = recording.plots
-    sites = [site_of(config.site_for(s.system)) for s in plots.sources]
-    good = usable(plots, sites)
-    if not good.any():
-        lost = (plots.reason == 0) & ~good
-        count = np.bincount(plots.source[lost], minlength=len(plots.sources)) if len(plots) else np.zeros(0, int)
-        wanted = [_site_wanted(source, int(n)) for source, n in zip(plots.sources, count, strict=True) if n]
-        reason = np.where(lost, _SITE_UNKNOWN, plots.reason).astype(np.int8)
-        raise DataError(_nothing_left(replace(plots, reason=reason), [*recording.problems, *wanted]))
+    if not seen.usable:
+        wanted = [_site_wanted(system, count) for system, count in seen.unplaced.items()]
+        raise DataError(_nothing_left(seen.reasons, [*seen.problems, *wanted]))
 
 
-def _nothing_left(plots: Plots, problems: Sequence[str]) -> str:
+def _nothing_left(counts: npt.NDArray[np.int64], problems: Sequence[str]) -> str:
     """Say why none of the reports can be tracked."""
-    if not len(plots):
+    if not counts.any():
         return "the inputs hold no target report. " + " ".join(problems)
-    counts = np.bincount(plots.reason, minlength=len(REASONS))
     listed = ", ".join(f"{counts[k]} {REASONS[k]}" for k in np.argsort(-counts) if k and counts[k])
-    if (plots.reason == REASONS.index("system track")).all():
+    if counts[REASONS.index("system track")] == counts.sum():
         listed += " (another system's tracks are shown by saltus info and never tracked again)"
     return " ".join([f"no report can be tracked: {listed}.", *problems])

@@ -10,10 +10,12 @@ from saltus.engine import SensorSetup, Session, Setup
 from saltus.engine.learn import sigmas
 from saltus.engine.saved import setup_toml
 from saltus.errors import DataError
+from saltus.io.inputs import left_out
 from saltus.io.write import output_file, write_text
 from saltus.progress import progress_bar
 from saltus.run.follow import told_periods
 from saltus.run.problems import refuse_unusable
+from saltus.run.seen import Seen
 from saltus.text import say, shown
 
 __all__ = ["setup_files"]
@@ -48,18 +50,18 @@ def setup_files(
         raise DataError(f"{output}: would be overwritten, and is what the setup is made of. Give another -o.")
     with progress_bar() as bar, output_file(output) as path:
         config = load_config(config_path, date=date, framing=framing).model_copy(update={"learnt": None})
-        recording = config.read(inputs, bar.reading)
-        refuse_unusable(recording, config)
-        session = Session.open(
-            config, use_identity=identity == "use", periods=told_periods(recording), hold=0.0, bar=bar
-        )
-        plots, start = recording.plots, 0
-        while start < len(plots) and not session.learnt:
-            session.feed(plots.take(slice(start, start + _CHUNK)))
-            start += _CHUNK
+        session, seen = Session.open(config, use_identity=identity == "use", hold=0.0, bar=bar), Seen(config)
+        for piece in config.read_in_order(inputs, bar.reading):
+            seen.add(piece)
+            session.tell_periods(told_periods(seen.contents))
+            for start in range(0, 0 if session.learnt else len(piece.plots), _CHUNK):
+                session.feed(piece.plots.take(slice(start, start + _CHUNK)))
+            if session.learnt:
+                break
+        refuse_unusable(seen)
         setup = session.settle()
-        write_text(path, setup_toml(setup, [shown(name) for name in plots.files]))
-    for problem in recording.problems:
+        write_text(path, setup_toml(setup, [shown(name) for name in piece.plots.files]))
+    for problem in (*left_out(inputs), *seen.problems):
         say(f"note: {problem}")
     for sensor in setup.sensors:
         say(_line(sensor))
