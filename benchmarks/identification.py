@@ -9,7 +9,8 @@ centre's tracks. Three runs, each judged by what it did not see:
 * radar and ADS-B in. The referee is the address of the multilateration target within 40 m of a radar report. A radar
   track is the radar's own number; it lies on an aircraft while the referee says so. One that lies 30 s or more on an
   aircraft with ADS-B must be identified with it, no other; and reports with no multilateration target within 150 m
-  must not be on a system track with an ADS-B identity.
+  must not be on a system track with an ADS-B identity. Of the radar reports within 60 m of a target whose aircraft has
+  ADS-B at that time, and that are on a track, how many are on one with its address, or with another one?
 * ADS-B and multilateration in, addresses hidden from both. The referee are those addresses: of the multilateration
   reports whose aircraft has an ADS-B report within 3 s and has had for 30 s, how many share a system track with it?
 * The plots and the centre's tracks, codes hidden. The referee are the codes: every code that 20 plots or more and
@@ -44,6 +45,7 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 _NEAR, _ALONE = 40.0, 150.0  # m: a radar report on a target, and off all of them
+_ON = 60.0  # m: a radar report of a target, of whatever track
 _TOGETHER = 3.0  # s between reports that are of one time
 _LONG = 30.0  # s
 _FEWEST = 20  # plots of a code
@@ -139,6 +141,7 @@ def surface(folder: Path) -> list[Line]:
     known = _wide(every.icao24[at][adsb])
     _, silence = latest(every.time[at][adsb], known, known, time, code)
     lines = _radar_tracks(every.local_id[at][radar], time, code, (code >= 0) & (silence <= _TOGETHER), given)
+    lines += _named(time, np.where(distance < _ON, address, -1), (every.time[at][adsb], known), track, given)
     far = distance >= _ALONE
     share = f"{(given[far] >= 0).sum()} of {far.sum()} = {100 * (given[far] >= 0).mean():.2f} %"
     shown = ", ".join(f"{bias[k]['value']:.1f} ± {bias[k]['sd']:.1f}" for k in ("east_m", "north_m"))
@@ -218,6 +221,32 @@ def _radar_tracks(own: Index, time: Array, code: Index, equipped: npt.NDArray[np
     ]
 
 
+def _named(time: Array, code: Index, sent: tuple[Array, Index], track: Index, given: Index) -> list[Line]:
+    """Judge each radar report on an aircraft that sends ADS-B at that time by the identity of its system track.
+
+    Args:
+        time: of the radar reports, s.
+        code: address of the aircraft that each is of, by the referee, -1 none.
+        sent: times and addresses of the ADS-B reports.
+        track: system track of each radar report, -1 none.
+        given: address that each radar report got, -1 none.
+    """
+    _, silence = latest(sent[0], sent[1], sent[1], time, code)
+    every = (code >= 0) & (silence <= _TOGETHER)
+    on = every & (track >= 0)
+    middle = np.median(time)
+    halves = [on & (time <= middle), on & (time > middle)]
+
+    def shares(hit: npt.NDArray[np.bool_]) -> str:
+        return f"{100.0 * hit[on].mean():.2f} % ({', '.join(f'{100.0 * hit[h].mean():.2f}' for h in halves)})"
+
+    return [
+        Line("reports on aircraft that have ADS-B at that time", f"{every.sum()}, {on.sum()} of them on tracks"),
+        Line("  with the right address (first half, second half)", shares(given == code), ">= 97 %"),
+        Line("  with a false one", shares((given >= 0) & (given != code)), "<= 0.05 %"),
+    ]
+
+
 def _others(seen: list[tuple[int, int, Index]], given: Index, address: int, on: Index) -> list[tuple[int, Index]]:
     """Other radar tracks of an aircraft that were identified with it, where they were."""
     return [(n, rows[given[rows] == address]) for n, a, rows in seen if a == address and rows is not on]
@@ -250,7 +279,7 @@ def hidden(folder: Path) -> list[Line]:
     bias = found.biases["CAT021:0/107"]["biases"]
     return [
         Line("reports seen by both", str(int(both.sum()))),
-        Line("  of those on a common track: with its own ADS-B", f"{share:.2f} %", ">= 99 %"),
+        Line("  of those on a common track: with its own ADS-B", f"{share:.3f} %", ">= 99.9 %"),
         Line("  with another aircraft's ADS-B, of all", f"{wrong:.2f} %", "<= 0.2 %"),
         Line("  identified, 30 s after both began or later", f"{100 * (right & settled).sum() / settled.sum():.2f} %"),
         Line(

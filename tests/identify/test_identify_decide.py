@@ -41,7 +41,8 @@ def kinds(decisions):
 def test_a_pair_is_declared_when_sure_and_kept_until_the_evidence_turns():
     found = decide_pairs(told({(0, 1): [0, 6, 8, 2, -3, -5, 6, 9, 9]}), [0, 1], TOLD)
     assert spells(found) == [(0, 1, 2, 5), (0, 1, 7, 8)]
-    np.testing.assert_allclose(found.episodes.probability[0], posterior([8.0, 2.0, -3.0]).mean())
+    np.testing.assert_allclose(found.episodes.probability, posterior([8.0, 9.0]))  # as declared: known then
+    assert found.episodes.since.tolist() == [-np.inf, -np.inf] and found.episodes.until.tolist() == [2.0, 8.0]
     assert not found.conflicts
 
 

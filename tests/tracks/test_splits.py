@@ -78,6 +78,7 @@ def test_the_later_of_two_tracks_of_one_system_is_the_echo():
         time_to=np.array([60.0, 40.0, 80.0, 70.0, 55.0]),
         system_track=np.array([1, 2, 1, 1, 1]),
         probability=np.ones(5),
+        time_known=np.full(5, 80.0),
     )
     spells = second_echoes(segments, np.array([0, 0, 1, 0]))
     assert sorted(spells) == [(1, 40.0, 60.0), (3, 50.0, 55.0), (3, 50.0, 55.0)]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,13 +16,28 @@ from saltus.records import Plots
 from saltus.tracks.bias import PARAMETERS
 from saltus.tracks.identities import identify
 from saltus.tracks.local import LocalSystem, Party, foreign_systems, local_system
-from saltus.tracks.membership import Segments, segments
+from saltus.tracks.membership import Change, Local, Merger, Segments, known_since, segments
 from saltus.tracks.rows import Tracked, join_rows
 from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.system_tracks import Part, track_systems
 from saltus.tracks.systems import Registered, lasting_difference, register_all
 
-__all__ = ["Identified", "bias_tables", "identification_table", "published_tracks", "together"]
+__all__ = ["IDENTIFICATIONS", "Identified", "bias_tables", "identification_table", "published_tracks", "together"]
+
+
+_TEXT, _NUMBER, _TIME = pa.string(), pa.int64(), pa.float64()
+IDENTIFICATIONS = pa.schema(
+    {
+        "track_id": _NUMBER,
+        "system": _TEXT,
+        "local_id": _TEXT,
+        "time_from": _TIME,
+        "time_to": _TIME,
+        "probability": _TIME,
+        "time_known": _TIME,
+        "merged_into": _NUMBER,
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +47,8 @@ class Identified:
     systems: list[LocalSystem]
     registered: list[Registered]
     segments: Segments  # system tracks are numbered as in the published rows
+    mergers: Sequence[Merger]  # numbers of the running picture that are not used any more
+    changes: Sequence[Change]
     decisions: Decisions
     evidence: Evidence
 
@@ -90,11 +107,17 @@ def _single(system: LocalSystem) -> Identified:
     known = tracks.track[first] if len(first) else np.zeros(0, np.int64)
     ids = system.ids[known]
     lives = Segments(
-        known, tracks.time[first], tracks.time[last] if len(first) else np.zeros(0), ids, np.ones(len(ids))
+        known,
+        tracks.time[first],
+        tracks.time[last] if len(first) else np.zeros(0),
+        ids,
+        np.ones(len(ids)),
+        system.ready[known],
     )
     none = np.zeros(0)
-    nobody = Episodes(none.astype(np.int64), none.astype(np.int64), none, none, none)
-    return Identified([system], [Registered(system.name, "", None)], lives, Decisions(nobody, ()), join_evidence([]))
+    nobody = Episodes(none.astype(np.int64), none.astype(np.int64), none, none, none, none, none)
+    alone = [Registered(system.name, "", None)]
+    return Identified([system], alone, lives, (), (), Decisions(nobody, ()), join_evidence([]))
 
 
 def _reference(setup: Setup, parties: Sequence[Party], systems: Sequence[str]) -> str:
@@ -112,19 +135,19 @@ def _reference(setup: Setup, parties: Sequence[Party], systems: Sequence[str]) -
 def _identified(local: Sequence[LocalSystem], settings: SystemsSettings, config: Config) -> Identified:
     registered, how = register_all(local, settings, config.registration)
     decisions, evidence = identify(registered, how, settings, config.filter)
-    begin, end = [], []
-    for system in local:
+    locals_, end = [], []
+    for number, system in enumerate(local):
         tracks = system.view.tracks
         first = np.searchsorted(tracks.track, np.arange(len(system.ids)))
         last = np.searchsorted(tracks.track, np.arange(len(system.ids)), side="right") - 1
-        begin.append(tracks.time[first])
         end.append(tracks.time[last])
+        locals_ += [
+            Local(begin, number, address, not system.own)
+            for begin, address in zip(tracks.time[first].tolist(), system.view.icao24.tolist(), strict=True)
+        ]
     ready = np.concatenate([s.ready for s in local])
-    foreign = np.repeat([not s.own for s in local], [len(s.ids) for s in local])
-    lives = segments(
-        np.concatenate(begin), ready, np.concatenate(end), decisions.episodes, settings.settle, foreign=foreign
-    )
-    return Identified(registered, how, lives, decisions, evidence)
+    lives, membership = segments(locals_, ready, np.concatenate(end), decisions.episodes)
+    return Identified(registered, how, lives, membership.mergers, membership.changes, decisions, evidence)
 
 
 def _joined(tracked: Mapping[Party, Tracked], whole: Identified, setup: Setup) -> Tracked:
@@ -139,30 +162,66 @@ def _joined(tracked: Mapping[Party, Tracked], whole: Identified, setup: Setup) -
     found = track_systems(
         parts, whole.segments, lasting, config.filter, config.tracker, waits, use_identity=setup.use_identity
     )
-    return Tracked([found.rows], found.measurements, found.assignments)
+    rows = found.rows
+    known = np.maximum(rows.time_known, known_since(whole.changes, rows.track_id, rows.time))
+    return Tracked([rows._replace(time_known=known)], found.measurements, found.assignments)
+
+
+class _Stretches(NamedTuple):
+    """Columns of identifications, before they have names."""
+
+    track_id: npt.NDArray[np.int64]
+    local: npt.NDArray[np.int64]
+    time_from: npt.NDArray[np.float64]
+    time_to: npt.NDArray[np.float64]
+    probability: npt.NDArray[np.float64]
+    time_known: npt.NDArray[np.float64]
+    merged_into: npt.NDArray[np.int64]  # 0: into none
 
 
 def identification_table(whole: Identified) -> pa.Table:
     """Return one row for each stretch of time in which a system's local track was part of a system track.
 
-    The first local track of a system track has probability 1; another one that with which it was declared the same
-    object.
+    The local track that names a system track has probability 1; another one that with which it was declared the same
+    object. A system track that was found to be another one has rows that say which, and when that became known.
     """
-    s = whole.segments
+    found = _Stretches._make(np.concatenate(column) for column in zip(_held(whole), _merged(whole), strict=True))
+    order = np.lexsort((found.time_from, found.track_id, found.time_known))
+    found = _Stretches._make(column[order] for column in found)
     names = np.repeat([x.name for x in whole.systems], [len(x.ids) for x in whole.systems])
     labels = [label for x in whole.systems for label in x.local_id]
-    order = np.lexsort((s.time_from, s.system_track))
-    order = order[np.isin(s.system_track[order], published_tracks(whole))]
     return pa.table(
-        {
-            "track_id": pa.array(s.system_track[order], pa.int64()),
-            "system": pa.array([str(names[k]) for k in s.track[order]], pa.string()),
-            "local_id": pa.array([labels[k] or None for k in s.track[order]], pa.string()),
-            "time_from": pa.array(s.time_from[order], pa.float64()),
-            "time_to": pa.array(s.time_to[order], pa.float64()),
-            "probability": pa.array(s.probability[order], pa.float64()),
-        }
+        [
+            found.track_id,
+            [str(names[k]) for k in found.local],
+            [labels[k] or None for k in found.local],
+            *(found.time_from, found.time_to, found.probability, found.time_known),
+            pa.array(found.merged_into, pa.int64(), mask=found.merged_into == 0),
+        ],
+        schema=IDENTIFICATIONS,
     )
+
+
+def _held(whole: Identified) -> _Stretches:
+    """What holds in the end."""
+    s = whole.segments
+    at = np.flatnonzero(np.isin(s.system_track, published_tracks(whole)))
+    columns = (s.system_track, s.track, s.time_from, s.time_to, s.probability, s.time_known)
+    return _Stretches._make([*(column[at] for column in columns), np.zeros(len(at), np.int64)])
+
+
+def _merged(whole: Identified) -> _Stretches:
+    """Numbers of the running picture that were given up."""
+    foreign = np.repeat([not x.own for x in whole.systems], [len(x.ids) for x in whole.systems])
+    end = {int(k): float(t) for k, t in zip(whole.segments.track, whole.segments.time_to, strict=True)}  # of the last
+    rows = [
+        (m.number, m.track, m.time_from, max(m.time_from, min(m.known, end[m.track])), 1.0, m.known, m.into)
+        for m in whole.mergers
+        if not foreign[m.track]
+    ]
+    kinds = (np.int64, np.int64, *(np.float64,) * 4, np.int64)
+    columns = zip(*rows, strict=True) if rows else ((),) * len(kinds)
+    return _Stretches._make(np.array(column, kind) for column, kind in zip(columns, kinds, strict=True))
 
 
 def published_tracks(whole: Identified) -> npt.NDArray[np.int64]:

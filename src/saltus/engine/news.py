@@ -13,7 +13,7 @@ from saltus.records import REASONS, Plots
 from saltus.tracks.output import ELSEWHERE, NOT_CONFIRMED, SPLIT, report_table, track_table
 from saltus.tracks.rows import Fates, Fed, Rows, join_rows
 
-__all__ = ["News", "no_identifications"]
+__all__ = ["News"]
 
 _Index = npt.NDArray[np.int64]
 _Array = npt.NDArray[Any]
@@ -99,13 +99,6 @@ class News:
         """Go on from what `state` gave."""
         self._number = np.array(state["number"])
         self._kept = {name: np.array(values) for name, values in state.get("kept", {}).items()}
-
-
-def no_identifications() -> pa.Table:
-    """Return the columns of identifications, without a row."""
-    text, number = pa.string(), pa.float64()
-    names = {"track_id": pa.int64(), "system": text, "local_id": text}
-    return pa.schema({**names, **dict.fromkeys(("time_from", "time_to", "probability"), number)}).empty_table()
 
 
 def _reasons(fates: Fates) -> list[str]:

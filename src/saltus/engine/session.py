@@ -11,11 +11,12 @@ import pyarrow as pa
 
 from saltus.config import Config, load_config
 from saltus.engine.checkpoint import begin_anew, load_checkpoint, save_checkpoint, understood
+from saltus.engine.identified import IDENTIFICATIONS
 from saltus.engine.intake import Arrived, Intake, Leap, numbered
 from saltus.engine.journal import Journal, foreign_columns
 from saltus.engine.learn import first_setup, usable, with_new_sources
 from saltus.engine.local import LocalTracking
-from saltus.engine.news import News, no_identifications
+from saltus.engine.news import News
 from saltus.engine.result import Result, finished
 from saltus.engine.saved import saved_setup
 from saltus.engine.setup import Setup, site_of
@@ -324,7 +325,7 @@ class Session:
     def _published(self) -> Published:
         kept = [tracking.referred() for tracking in self._locals.values()]
         tables = self._news.taken(self._setups[-1] if self._setups else None, kept)
-        return Published(*tables, no_identifications(), self.health())
+        return Published(*tables, IDENTIFICATIONS.empty_table(), self.health())
 
     def save(self, folder: Path | str, words: Mapping[str, Any] | None = None) -> None:
         """Save the session: `restore` goes on from here as if nothing had been.

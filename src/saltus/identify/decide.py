@@ -36,7 +36,8 @@ class DecisionSettings:
         p_false_split: the same for two tracks of one system, which are two objects unless the evidence overwhelms.
         hysteresis: log-odds by which a declared pair may fall short of the best alternative, nats.
         every: s between decisions.
-        hold: s for which the last ratio of a pair holds when no further row comes.
+        hold: s for which the last ratio of a declared pair holds when no further row comes; of another one half as
+            long.
     """
 
     prior: float = 0.5
@@ -60,13 +61,15 @@ class DecisionSettings:
 
 
 class Episodes(NamedTuple):
-    """While which two tracks were one object."""
+    """While which two tracks were one object, and in hindsight: since when, and until when, the evidence said so."""
 
     a: Int[np.ndarray, " e"]
     b: Int[np.ndarray, " e"]
     time_from: Float[np.ndarray, " e"]  # s, of the decision that declared them
     time_to: Float[np.ndarray, " e"]  # s, of the decision that parted them, or of their last row
-    probability: Float[np.ndarray, " e"]  # mean of the probabilities at its decisions
+    probability: Float[np.ndarray, " e"]  # with which they were declared
+    since: Float[np.ndarray, " e"]  # s, of the last evidence before `time_from` that they were two; -inf: never any
+    until: Float[np.ndarray, " e"]  # s, of the last evidence that they were one
 
 
 class Decisions(NamedTuple):
@@ -94,31 +97,36 @@ class _Links:
 
     def __init__(self, n: int) -> None:
         self.on = np.zeros(n, bool)
-        self._since, self._total, self._count = np.zeros(n), np.zeros(n), np.zeros(n, np.int64)
-        self._done: list[tuple[Index, FloatArray, FloatArray, FloatArray]] = []
+        self._two, self._one = np.full(n, -np.inf), np.full(n, -np.inf)  # s: when evidence said so last
+        self._from, self._since, self._prob = np.zeros(n), np.zeros(n), np.zeros(n)
+        self._done: list[tuple[Index, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]] = []
+
+    def weigh(self, now: float, score: FloatArray, bound: FloatArray) -> None:
+        """Note which pairs the evidence says to be one or two."""
+        self._one[score >= bound] = now
+        self._two[np.isfinite(score) & (score <= -bound)] = now
 
     def update(self, now: float, keep: Index, probs: FloatArray, ended: FloatArray) -> None:
         """Declare the pairs `keep` with their probabilities and part the others, which ended at `ended` (P,)."""
-        on = np.zeros(len(self.on), bool)
-        on[keep] = True
+        on, prob = np.zeros(len(self.on), bool), np.zeros(len(self.on))
+        on[keep], prob[keep] = True, probs
         self.part(np.flatnonzero(self.on & ~on), ended)
         fresh = np.flatnonzero(on & ~self.on)
-        self._since[fresh], self._total[fresh], self._count[fresh] = now, 0.0, 0
-        self._total[keep] += probs
-        self._count[keep] += 1
+        self._from[fresh], self._since[fresh], self._prob[fresh] = now, self._two[fresh], prob[fresh]
         self.on = on
 
     def part(self, which: Index, ended: FloatArray) -> None:
         """End episodes."""
-        mean = self._total[which] / np.maximum(self._count[which], 1)
-        self._done.append((which, self._since[which], np.maximum(ended[which], self._since[which]), mean))
+        since, until = self._from[which], np.maximum(ended[which], self._from[which])
+        last = np.clip(self._one[which], since, until)
+        self._done.append((which, since, until, self._prob[which], self._since[which], last))
 
     def episodes(self, pairs: Index) -> Episodes:
         """All episodes, by time."""
-        which, since, until, probs = (np.concatenate(column) for column in zip(*self._done, strict=True))
+        which, since, *rest = (np.concatenate(column) for column in zip(*self._done, strict=True))
         order = np.lexsort((which, since))
         a, b = pairs[which[order]].T
-        return Episodes(a, b, since[order], until[order], probs[order])
+        return Episodes(a, b, since[order], *(column[order] for column in rest))
 
 
 def decide_pairs(
@@ -153,8 +161,10 @@ def decide_pairs(
     for now, rows in _decisions(evidence, settings):
         which = evidence.pair[rows]
         score[which], last[which] = evidence.llr[rows] + odds, evidence.time[rows]
-        fresh = now - last <= settings.hold
-        keep, probs = _decide(problem, now, np.where(fresh, score, -np.inf), links.on, log)
+        fresh = now - last <= np.where(links.on, settings.hold, 0.5 * settings.hold)
+        known = np.where(fresh, score, -np.inf)
+        links.weigh(now, known, problem.bound)
+        keep, probs = _decide(problem, now, known, links.on, log)
         links.update(now, keep, probs, np.where(fresh, now, last))
     links.part(np.flatnonzero(links.on), last)
     return Decisions(links.episodes(problem.pairs), log.conflicts())

@@ -34,7 +34,6 @@ UNITS: dict[str, dict[str, str]] = {
         "split_offset": "m",
         "hysteresis": "nats",
         "window": "s",
-        "settle": "s",
         "offset_time": "s",
         "spacing": "s",
         "speed": "mps",

@@ -1,6 +1,15 @@
-"""To which system track each local track belongs, and when: decisions as segments of time."""
+"""To which system track each local track belongs: decisions, each of which holds backwards, as segments of time.
 
-from collections.abc import Iterable
+An *object* is what hangs together: local tracks joined by the links that decisions made between them. A link holds from
+the time since which the evidence did not contradict it, mostly the beginning of the later track. Where it did, one of
+both tracks went from one object over to another: it is cut there into two *pieces*, which may belong to different
+objects. The same is done where a decision is taken back. Every piece gets a number when it becomes known, from one
+counter; an object's number is the least of its pieces', measured ones first. So an object has one number from its first
+report, and the number that a piece had before it was found to be a part of an older object is merged into that one's.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -9,12 +18,11 @@ import numpy.typing as npt
 from saltus.identify import Episodes
 from saltus.shapes import Float, Int
 
-__all__ = ["Segments", "segments"]
+__all__ = ["Change", "Local", "Membership", "Merger", "Segments", "known_since", "segments"]
 
 _Array = npt.NDArray[np.float64]
-_Index = npt.NDArray[np.int64]
 
-_PART, _BIRTH, _JOIN = 0, 1, 2  # the order of what happens at one time
+_DEATH, _PART, _BIRTH, _JOIN = 0, 1, 2, 3  # the order of what becomes known at one time
 
 
 class Segments(NamedTuple):
@@ -23,8 +31,9 @@ class Segments(NamedTuple):
     track: Int[np.ndarray, " s"]  # local track, numbered through all systems
     time_from: Float[np.ndarray, " s"]  # s
     time_to: Float[np.ndarray, " s"]  # s; the next segment begins there
-    system_track: Int[np.ndarray, " s"]  # from 1, in the order of their beginnings
-    probability: Float[np.ndarray, " s"]  # that the local track is the system track's object; 1 of the first one
+    system_track: Int[np.ndarray, " s"]  # number of the object
+    probability: Float[np.ndarray, " s"]  # that the local track is its object; 1 of the one that names it
+    time_known: Float[np.ndarray, " s"]  # s: when that became known
 
     def at(self, track: Int[np.ndarray, " n"], time: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
         """Return the segment of local tracks at times within their lives."""
@@ -37,155 +46,307 @@ class Segments(NamedTuple):
         return np.asarray(np.searchsorted(axis, at, side="right") - 1)
 
 
+class Merger(NamedTuple):
+    """A local track's system track was found to be another one: its number is not used any more."""
+
+    track: int  # local track
+    number: int  # of the system track until then
+    into: int
+    time_from: float  # s: since when the local track was a part of it
+    known: float  # s
+
+
+class Change(NamedTuple):
+    """From a time on, what a system track is made of is otherwise than was thought."""
+
+    number: int  # of the system track
+    time_from: float  # s
+    known: float  # s
+
+
+class Local(NamedTuple):
+    """A local track."""
+
+    begin: float  # s, of its first report
+    system: int
+    address: int = -1  # -1 unknown
+    foreign: bool = False  # another centre's
+
+
+class _Span(NamedTuple):
+    begin: float
+    number: int
+    probability: float
+    known: float
+
+
+class _Piece(NamedTuple):
+    track: int
+    place: int  # among the pieces of its track
+
+
+@dataclass(slots=True, eq=False)
+class _Link:
+    a: int
+    b: int
+    begin: float
+    end: float  # inf while it holds
+    probability: float
+
+
+class Membership:
+    """Objects as sets of pieces of local tracks, changed by what becomes known, in that order."""
+
+    def __init__(self) -> None:
+        """Begin without tracks."""
+        self._local: dict[int, Local] = {}
+        self._cuts: dict[int, list[float]] = {}  # where the pieces of each track begin
+        self._number: dict[int, list[int]] = {}  # of each piece
+        self._links: dict[int, list[_Link]] = {}
+        self._spans: dict[int, list[_Span]] = {}  # what holds now
+        self._ended: dict[int, float] = {}  # s: last report of each track that has
+        self._next = 1
+        self.mergers: list[Merger] = []
+        self.changes: list[Change] = []
+
+    def birth(self, k: int, local: Local, known: float) -> None:
+        """A local track is confirmed."""
+        self._local[k], self._links[k] = local, []
+        self._cuts[k], self._number[k] = [local.begin], [self._next]
+        self._spans[k] = [_Span(local.begin, self._next, 1.0, known)]
+        self.changes.append(Change(self._next, local.begin, known))
+        self._next += 1
+
+    def join(self, a: int, b: int, since: float, known: float, probability: float) -> None:
+        """Two local tracks are one object since a time.
+
+        Links taken back that say otherwise since then give way: one of a track with another track of the same system.
+        Where the evidence said otherwise before, or both have been parts of objects of different addresses, a track
+        without an address went over from one object to the other.
+        """
+        both = max(self._local[a].begin, self._local[b].begin)
+        since = max(since, both, self._held(a, b), self._held(b, a))
+        touched = self._around(a, b)
+        self._overrule(a, b, since)
+        self._overrule(b, a, since)
+        if since > both or self._clash(a, b, since):
+            self._cut(self._mover(a, b), since)
+        link = _Link(a, b, since, np.inf, probability)
+        self._links[a].append(link)
+        self._links[b].append(link)
+        self._renew(touched | self._around(a, b), known)
+
+    def part(self, a: int, b: int, at: float, known: float) -> None:
+        """Two local tracks that live on are two objects, from a time on."""
+        touched = self._around(a, b)
+        for link in [x for x in self._links[a] if {x.a, x.b} == {a, b} and x.end == np.inf]:
+            self._end(link, at)
+        self._cut(self._mover(a, b), max(at, *(self._local[k].begin for k in (a, b))))
+        self._renew(touched | self._around(a, b), known)
+
+    def _held(self, a: int, b: int) -> float:
+        """Return until when a was one object with another track of b's system, that ended and was never given up."""
+        others = {x.b if x.a == a else x.a for x in self._links[a] if x.end == np.inf} - {b}
+        system = self._local[b].system
+        rivals = [k for k in others if self._local[k].system == system != self._local[a].system]
+        return max((self._ended[k] for k in rivals if k in self._ended), default=-np.inf)
+
+    def death(self, k: int, last: float) -> None:
+        """A local track has ended, with a report at `last`, s."""
+        self._ended[k] = last
+
+    def _end(self, link: _Link, at: float) -> None:
+        link.end = min(link.end, at)
+        if link.end <= link.begin:
+            self._links[link.a].remove(link)
+            self._links[link.b].remove(link)
+
+    def _overrule(self, a: int, b: int, since: float) -> None:
+        """End a's links, taken back before, with other tracks of b's system that lived on."""
+        for link in [x for x in self._links[a] if since < x.end < np.inf]:
+            other = link.b if link.a == a else link.a
+            if other != b and self._local[other].system == self._local[b].system:
+                self._end(link, since)
+
+    def _mover(self, a: int, b: int) -> int:
+        """Return which of two tracks is the one that went over.
+
+        Another centre's; one without an address; that has ended since; that hangs together with fewer; the later one.
+        """
+
+        def likely(k: int) -> tuple[bool, bool, bool, int, int]:
+            local, held = self._local[k], sum(link.end == np.inf for link in self._links[k])
+            return local.foreign, local.address < 0, k in self._ended, -held, self._number[k][0]
+
+        return max((a, b), key=likely)
+
+    def _cut(self, k: int, at: float) -> None:
+        place = int(np.searchsorted(self._cuts[k], at))
+        if place < len(self._cuts[k]) and self._cuts[k][place] == at:
+            return
+        self._cuts[k].insert(place, at)
+        self._number[k].insert(place, self._next)
+        self._next += 1
+
+    def _clash(self, a: int, b: int, since: float) -> bool:
+        """Say whether the objects of two tracks at a time have different addresses."""
+        of = [{self._local[p.track].address for p in self._object(self._piece(k, since))} - {-1} for k in (a, b)]
+        return bool(of[0] and of[1] and of[0] != of[1])
+
+    def _piece(self, k: int, time: float) -> _Piece:
+        return _Piece(k, max(int(np.searchsorted(self._cuts[k], time, side="right")) - 1, 0))
+
+    def _reach(self, piece: _Piece) -> tuple[float, float]:
+        cuts, last = self._cuts[piece.track], self._ended.get(piece.track, np.inf)
+        return cuts[piece.place], min(cuts[piece.place + 1], last) if piece.place + 1 < len(cuts) else last
+
+    def _beside(self, piece: _Piece) -> Iterable[_Piece]:
+        """Pieces to which links lead from a piece."""
+        begin, end = self._reach(piece)
+        for link in self._links[piece.track]:
+            low, high = max(begin, link.begin), min(end, link.end)
+            other = link.b if link.a == piece.track else link.a
+            if low < high:
+                for place in range(len(self._cuts[other])):
+                    first, last = self._reach(_Piece(other, place))
+                    if max(first, low) < min(last, high):
+                        yield _Piece(other, place)
+
+    def _object(self, piece: _Piece) -> set[_Piece]:
+        """Everything that hangs together with a piece."""
+        found, open_ = {piece}, [piece]
+        while open_:
+            for near in self._beside(open_.pop()):
+                if near not in found:
+                    found.add(near)
+                    open_.append(near)
+        return found
+
+    def _around(self, a: int, b: int) -> set[int]:
+        """Tracks of the objects of all pieces of two tracks."""
+        pieces = [_Piece(k, place) for k in (a, b) for place in range(len(self._cuts[k]))]
+        return {p.track for piece in pieces for p in self._object(piece)}
+
+    def _renew(self, tracks: set[int], known: float) -> None:
+        """Find the numbers of tracks anew; note what is new since `known`."""
+        before = {k: self._spans[k] for k in tracks}
+        names: dict[_Piece, _Piece] = {}
+        for k in sorted(tracks):
+            self._spans[k] = self._renewed(k, before[k], names, known)
+        current = {spans[-1].number for k in tracks for spans in (self._spans[k],)}
+        for k in sorted(tracks):
+            old, new = before[k][-1], self._spans[k][-1]
+            if old.number != new.number and old.number not in current and old.known < known:
+                self.mergers.append(Merger(k, old.number, new.number, old.begin, known))
+
+    def _renewed(self, k: int, before: list[_Span], names: dict[_Piece, _Piece], known: float) -> list[_Span]:
+        out: list[_Span] = []
+        for place in range(len(self._cuts[k])):
+            piece = _Piece(k, place)
+            if piece not in names:
+                members = self._object(piece)
+                names |= dict.fromkeys(members, min(members, key=self._rank))
+            name, (begin, end) = names[piece], self._reach(piece)
+            number, probability = self._number[name.track][name.place], self._probability(piece, name)
+            starts = [begin, *(s.begin for s in before if begin < s.begin < end)]
+            for start in starts:
+                old = before[max(int(np.searchsorted([s.begin for s in before], start, side="right")) - 1, 0)]
+                same = old.number == number
+                if not same:
+                    self.changes += [Change(n, start, known) for n in (old.number, number)]
+                span = _Span(start, number, old.probability if same else probability, old.known if same else known)
+                if not out or out[-1][1:] != span[1:]:
+                    out.append(span)
+        return out
+
+    def _rank(self, piece: _Piece) -> tuple[bool, int]:
+        return self._local[piece.track].foreign, self._number[piece.track][piece.place]
+
+    def _probability(self, piece: _Piece, name: _Piece) -> float:
+        """Return 1 of the track that names the object, else the probability of the best of its own links."""
+        if piece.track == name.track:
+            return 1.0
+        begin, end = self._reach(piece)
+        mine = [x.probability for x in self._links[piece.track] if max(begin, x.begin) < min(end, x.end)]
+        return float(np.clip(max(mine, default=1.0), 0.0, 1.0))
+
+    def segments(self, end: _Array) -> Segments:
+        """Return what holds now; `end` is the time of the last report of each local track, s."""
+        rows = []
+        for k in sorted(self._spans):
+            last = float(end[k])
+            spans = [s for s in self._spans[k] if s.begin < last] or self._spans[k][:1]
+            stops = [*(s.begin for s in spans[1:]), last]
+            rows += [(k, s.begin, stop, s.number, s.probability, s.known) for s, stop in zip(spans, stops, strict=True)]
+        if not rows:
+            none, nobody = np.zeros(0), np.zeros(0, np.int64)
+            return Segments(nobody, none, none, nobody, none, none)
+        return Segments(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def known_since(changes: Sequence[Change], number: Int[np.ndarray, " n"], time: _Array) -> _Array:
+    """Return when it became known what system tracks are made of up to given times, (n,), s; -inf: always.
+
+    Args:
+        changes: of memberships.
+        number: system tracks, (n,).
+        time: up to which their reports count, (n,), s.
+    """
+    out = np.full(len(number), -np.inf)
+    if not changes:
+        return out
+    of, since, known = (np.array(column) for column in zip(*changes, strict=True))
+    for n in np.unique(number).tolist():
+        rows, mine = np.flatnonzero(number == n), np.flatnonzero(of == n)
+        mine = mine[np.argsort(since[mine], kind="stable")]
+        latest = np.append(-np.inf, np.maximum.accumulate(known[mine]))
+        out[rows] = latest[np.searchsorted(since[mine], time[rows], side="right")]
+    return out
+
+
 class _Event(NamedTuple):
-    time: float
+    known: float
     kind: int
     a: int
     b: int
+    time: float  # from when on it holds, s
+    probability: float
 
 
-class _Groups:
-    """System tracks as sets of local tracks; the older one survives when two meet, measured ones first."""
-
-    def __init__(self, begin: _Array, end: _Array, foreign: npt.NDArray[np.bool_]) -> None:
-        n = len(begin)
-        self._begin, self._end, self._foreign = begin, end, foreign
-        self._closed = np.zeros(n, bool)
-        self._of = np.zeros(n, np.int64)  # system track of each local track born, 0 none
-        self._since = begin.copy()
-        self._links: set[tuple[int, int]] = set()
-        self._next = 1
-        self.found: list[tuple[int, float, float, int]] = []
-
-    def birth(self, k: int) -> None:
-        self._of[k] = self._next
-        self._next += 1
-
-    def join(self, a: int, b: int, now: float) -> None:
-        self._links.add((a, b))
-        x, y = sorted((int(self._of[a]), int(self._of[b])), key=lambda of: (self._unmeasured(of), of))
-        if x != y:
-            self._move(np.flatnonzero(self._of == y), x, now)
-
-    def part(self, a: int, b: int, now: float) -> None:
-        """Take a link away: what hangs together with the first member of the system track keeps it."""
-        self._links.discard((a, b))
-        members = np.flatnonzero(self._of == self._of[a])
-        parts = self._components(members.tolist())
-        oldest = min(members.tolist(), key=lambda k: (self._foreign[k], self._begin[k], k))
-        for part in parts:
-            if oldest not in part:
-                self._move(np.array(sorted(part)), self._next, now)
-                self._next += 1
-
-    def _unmeasured(self, of: int) -> bool:
-        return bool(self._foreign[self._of == of].all())
-
-    def _components(self, members: list[int]) -> list[set[int]]:
-        parts: list[set[int]] = []
-        for k in members:
-            linked = {k} | {y for x, y in self._links if x == k} | {x for x, y in self._links if y == k}
-            touching = [p for p in parts if p & linked]
-            parts = [p for p in parts if not p & linked] + [{k}.union(*touching, linked & set(members))]
-        return parts
-
-    def _move(self, members: _Index, to: int, now: float) -> None:
-        for k in members.tolist():
-            if now >= self._end[k]:
-                self._close(k)
-            elif now > self._since[k]:
-                self.found.append((k, float(self._since[k]), now, int(self._of[k])))
-                self._since[k] = now
-            self._of[k] = to
-
-    def _close(self, k: int) -> None:
-        if not self._closed[k] and self._end[k] >= self._since[k]:
-            self.found.append((k, float(self._since[k]), float(self._end[k]), int(self._of[k])))
-        self._closed[k] = True
-
-    def close(self) -> None:
-        """End all lives."""
-        for k in np.flatnonzero(self._of).tolist():
-            self._close(k)
-
-
-def segments(
-    begin: _Array,
-    ready: _Array,
-    end: _Array,
-    episodes: Episodes,
-    settle: float,
-    *,
-    foreign: npt.NDArray[np.bool_] | None = None,
-) -> Segments:
-    """Cut the lives of local tracks at the decisions about them.
-
-    Two local tracks that are one object belong to one system track, the older one's, from the decision on; when the
-    decision is taken back while both live, the one that does not hang together with the oldest local track gets a new
-    system track. A track that ends takes nothing with it. A decision within `settle` seconds of the later track's
-    confirmation holds from that track's beginning.
+def segments(locals_: Sequence[Local], ready: _Array, end: _Array, episodes: Episodes) -> tuple[Segments, Membership]:
+    """Cut the lives of local tracks at what decisions say about them.
 
     Args:
-        begin: first report of each local track, (K,), s.
-        ready: its confirmation, (K,), s.
+        locals_: local tracks, (K,).
+        ready: when each was confirmed, (K,), s; inf: never.
         end: its last report, (K,), s.
         episodes: which tracks were one object, and when.
-        settle: s.
-        foreign: which are another centre's, (K,); a number stays with the tracks that have measurements. None: none is.
     """
-    groups = _Groups(begin, end, np.zeros(len(begin), bool) if foreign is None else foreign)
-    for event in sorted(_events(ready, end, episodes, settle)):
+    membership = Membership()
+    for event in sorted(_events(ready, end, episodes)):
         if event.kind == _BIRTH:
-            groups.birth(event.a)
+            membership.birth(event.a, locals_[event.a], event.known)
+        elif event.kind == _DEATH:
+            membership.death(event.a, event.time)
         elif event.kind == _JOIN:
-            now = event.time
-            later = event.a if ready[event.a] >= ready[event.b] else event.b
-            groups.join(event.a, event.b, float(begin[later]) if now <= ready[later] else now)
+            membership.join(event.a, event.b, event.time, event.known, event.probability)
         else:
-            groups.part(event.a, event.b, event.time)
-    groups.close()
-    if not groups.found:
-        none = np.zeros(0)
-        return Segments(none.astype(np.int64), none, none, none.astype(np.int64), none)
-    track, since, until, of = (np.array(column) for column in zip(*sorted(groups.found), strict=True))
-    first = begin if foreign is None else begin + np.where(foreign, np.ptp(begin) + 1.0, 0.0)
-    return Segments(track, since, until, _numbered(of, since), _probability(track, since, until, of, first, episodes))
+            membership.part(event.a, event.b, event.time, event.known)
+    return membership.segments(end), membership
 
 
-def _events(ready: _Array, end: _Array, episodes: Episodes, settle: float) -> Iterable[_Event]:
+def _events(ready: _Array, end: _Array, episodes: Episodes) -> Iterable[_Event]:
     for k, time in enumerate(ready.tolist()):
         if np.isfinite(time):
-            yield _Event(time, _BIRTH, k, k)
-    for a, b, since, until, _ in zip(*episodes, strict=True):
-        born = float(max(ready[a], ready[b]))
-        if not np.isfinite(born) or until < born:
+            yield _Event(time, _BIRTH, k, k, time, 1.0)
+            yield _Event(float(end[k]), _DEATH, k, k, float(end[k]), 1.0)
+    for row in zip(*(column.tolist() for column in episodes), strict=True):
+        e = Episodes(*row)
+        a, b = int(e.a), int(e.b)
+        born = max(float(ready[a]), float(ready[b]))
+        if not np.isfinite(born) or e.time_to < born:
             continue
-        yield _Event(born if since <= born + settle else float(since), _JOIN, int(a), int(b))
-        if until < min(end[a], end[b]):  # both live on: a change of mind
-            yield _Event(max(float(until), born if since <= born + settle else float(since)), _PART, int(a), int(b))
-
-
-def _numbered(of: _Index, since: _Array) -> _Index:
-    """Number system tracks from 1 in the order of their beginnings."""
-    names, place = np.unique(of, return_inverse=True)
-    first = np.full(len(names), np.inf)
-    np.minimum.at(first, place, since)
-    rank = np.empty(len(names), np.int64)
-    rank[np.lexsort((names, first))] = np.arange(1, len(names) + 1)
-    return np.asarray(rank[place])
-
-
-def _probability(track: _Index, since: _Array, until: _Array, of: _Index, begin: _Array, episodes: Episodes) -> _Array:
-    """Of each segment: 1 of the oldest local track, else that of its best link while the segment lasts."""
-    out = np.ones(len(track))
-    oldest: dict[int, int] = {}
-    for k in np.argsort(begin[track], kind="stable").tolist():
-        oldest.setdefault(int(of[k]), int(track[k]))
-    for s in range(len(track)):
-        if oldest[int(of[s])] == track[s]:
-            continue
-        mine = (episodes.a == track[s]) | (episodes.b == track[s])
-        mine &= (episodes.time_from <= until[s]) & (episodes.time_to >= since[s])
-        if mine.any():
-            out[s] = float(np.clip(episodes.probability[mine].max(), 0.0, 1.0))
-    return out
+        known = max(born, float(e.time_from))
+        yield _Event(known, _JOIN, a, b, float(e.since), float(e.probability))
+        if e.time_to < min(end[a], end[b]):  # both live on: a change of mind
+            yield _Event(max(float(e.time_to), known), _PART, a, b, float(e.until), 1.0)

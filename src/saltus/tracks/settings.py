@@ -172,7 +172,6 @@ class SystemsSettings:
         split_offset: standard deviation of the distance between two echoes of one object, each axis, m.
         hysteresis: log-odds by which a declared pair may fall short of the best alternative, nats.
         window: s; what tracks did longer ago says nothing about whether they are one object now.
-        settle: s after its confirmation within which the decision on a new local track counts from its beginning.
         offset_time: s that the difference between two systems' positions of one object lasts.
         spacing: s that short errors last: of reports of one track that follow faster, one in so many s counts.
         speed: standard deviation of each component of an object's velocity, m/s.
@@ -186,7 +185,6 @@ class SystemsSettings:
     split_offset: float = 20.0
     hysteresis: float = 5.0
     window: float = 120.0
-    settle: float = 12.0
     offset_time: float = 60.0
     spacing: float = 10.0
     speed: float = 100.0
@@ -202,7 +200,6 @@ class SystemsSettings:
             "split_offset",
             "hysteresis",
             "window",
-            "settle",
             "offset_time",
             "spacing",
             "speed",
