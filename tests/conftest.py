@@ -37,6 +37,7 @@ _RUN_FILES = {
     "test_sights.py",
     "test_source_conditions.py",
     "test_splits.py",
+    "test_dense.py",
     "test_tracker.py",
     "test_tracker_pieces.py",
 }

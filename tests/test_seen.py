@@ -21,7 +21,9 @@ def test_a_sample_is_every_so_many_th_whatever_the_pieces(monkeypatch, size):
     monkeypatch.setattr(module, "_DRAWN", 100)
     seen = Seen(Config())
     for begin in range(0, 1000, size):
-        seen.add(Recording(piece(begin, min(size, 1000 - begin), kind=np.full(min(size, 1000 - begin), 3)), None, (), ()))
+        seen.add(
+            Recording(piece(begin, min(size, 1000 - begin), kind=np.full(min(size, 1000 - begin), 3)), None, (), ())
+        )
     plots, number = seen.sample()
     assert seen.n == 1000 and seen.every == 16
     assert number.tolist() == list(range(0, 1000, 16))

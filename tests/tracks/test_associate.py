@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from saltus.tracks.associate import Pairs, assign, near_pairs
+from saltus.tracks.associate import Pairs, assign, near_pairs, nearest_pairs
 
 
 def best_total(pairs, gain):
@@ -67,6 +67,28 @@ def test_near_pairs_are_those_of_a_loop(rng):
     found = near_pairs(tracks, reach, plots)
     assert len(found.track) == len(expected)
     assert set(zip(found.track.tolist(), found.plot.tolist(), strict=True)) == expected
+
+
+@pytest.mark.parametrize("most", [1, 3, 10])
+def test_a_crowded_track_keeps_its_nearest(rng, most):
+    tracks, plots = rng.uniform(-1e4, 1e4, (80, 2)), rng.uniform(-1e4, 1e4, (90, 2))
+    reach = rng.uniform(0.0, 6e3, 80)
+    found, every = near_pairs(tracks, reach, plots, most), near_pairs(tracks, reach, plots)
+    apart = np.linalg.norm(tracks[every.track] - plots[every.plot], axis=1)
+    expected, crowded = set(), 0
+    for i in range(80):
+        mine = np.flatnonzero(every.track == i)
+        crowded += len(mine) > most
+        expected |= {(i, int(every.plot[j])) for j in mine[np.argsort(apart[mine])][:most]}
+    assert 0 < crowded < 80
+    assert sorted(zip(found.track.tolist(), found.plot.tolist(), strict=True)) == sorted(expected)
+    keep = nearest_pairs(every, apart, most)
+    assert set(zip(every.track[keep].tolist(), every.plot[keep].tolist(), strict=True)) == expected
+
+
+def test_of_equal_distances_the_earlier_pair_is_nearer():
+    keep = nearest_pairs(Pairs(np.array([1, 0, 1, 1]), np.array([5, 6, 7, 8])), np.array([2.0, 9.0, 2.0, 1.0]), 2)
+    assert keep.tolist() == [True, True, False, True]
 
 
 @pytest.mark.parametrize(("n_tracks", "n_plots"), [(0, 3), (3, 0), (0, 0), (2, 2)])

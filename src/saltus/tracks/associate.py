@@ -7,10 +7,11 @@ import numpy.typing as npt
 
 from saltus.identify.assignment import best_assignment
 
-__all__ = ["Pairs", "assign", "equal_codes", "join_pairs", "near_pairs"]
+__all__ = ["Pairs", "assign", "equal_codes", "join_pairs", "near_pairs", "nearest_pairs"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
+_Mask = npt.NDArray[np.bool_]
 
 
 _AT_ONCE = 4096  # pairs up to which all distances cost less than a tree
@@ -23,22 +24,46 @@ class Pairs(NamedTuple):
     plot: _Index  # (P,)
 
 
-def near_pairs(tracks: _Array, reach: _Array, plots: _Array) -> Pairs:
-    """Return all pairs with |track - plot| <= reach of the track.
+def near_pairs(tracks: _Array, reach: _Array, plots: _Array, most: int | None = None) -> Pairs:
+    """Return all pairs with |track - plot| <= reach of the track, or the nearest `most` of a track that has more.
 
     Args:
         tracks: plane positions, (K, 2), m.
         reach: radius about each, (K,), m.
         plots: plane positions, (N, 2), m.
+        most: pairs of one track; None: no bound.
     """
     if len(tracks) * len(plots) <= _AT_ONCE:  # a tree costs more than all distances
         apart = np.hypot(tracks[:, None, 0] - plots[:, 0], tracks[:, None, 1] - plots[:, 1])
         return Pairs(*np.nonzero(apart <= reach[:, None]))
     from scipy.spatial import cKDTree
 
-    found = cKDTree(plots).query_ball_point(tracks, reach)
-    counts = np.array([len(f) for f in found])
-    return Pairs(np.repeat(np.arange(len(tracks)), counts), np.concatenate([np.asarray(f, np.intp) for f in found]))
+    tree = cKDTree(plots)
+    counts = np.asarray(tree.query_ball_point(tracks, reach, return_length=True), np.intp)
+    crowded = np.zeros(len(tracks), bool) if most is None else counts > most
+    found = tree.query_ball_point(tracks[~crowded], reach[~crowded])
+    near = np.concatenate([np.zeros(0, np.intp), *(np.asarray(f, np.intp) for f in found)])
+    pairs = Pairs(np.repeat(np.flatnonzero(~crowded), counts[~crowded]), near)
+    if not crowded.any():
+        return pairs
+    nearest = np.asarray(tree.query(tracks[crowded], k=range(1, 1 + (most or 0)))[1], np.intp)
+    return join_pairs(pairs, Pairs(np.repeat(np.flatnonzero(crowded), nearest.shape[1]), nearest.ravel()))
+
+
+def nearest_pairs(pairs: Pairs, distance: _Array, most: int) -> _Mask:
+    """Say which pairs are among the nearest `most` of their track; of equal distances the earlier pair is nearer.
+
+    Args:
+        pairs: candidates.
+        distance: of each, (P,).
+        most: pairs of one track.
+    """
+    order = np.lexsort((distance, pairs.track))
+    track = pairs.track[order]
+    first = np.searchsorted(track, track)
+    keep = np.zeros(len(track), bool)
+    keep[order] = np.arange(len(track)) - first < most
+    return keep
 
 
 def equal_codes(tracks: npt.NDArray[np.integer], plots: npt.NDArray[np.integer]) -> Pairs:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.associate import Pairs, equal_codes, join_pairs, near_pairs
+from saltus.tracks.associate import Pairs, equal_codes, join_pairs, near_pairs, nearest_pairs
 from saltus.tracks.faults import SourceCondition, rays
 from saltus.tracks.identity import conflicting
 from saltus.tracks.kinematics import Kinematics, Plan
@@ -21,6 +21,7 @@ _Index = npt.NDArray[np.intp]
 _POSITION, _VELOCITY = np.array([0, 2, 4]), np.array([1, 3, 5])
 _FAULT_GATE = 0.99
 _SOONEST = 0.75  # of the update period: what comes sooner after a first plot is taken for a neighbour's
+_COARSE = 8  # times the candidates of a track: those nearest in metres, of which the nearest in deviations are kept
 _LATEST = -2.0  # s: how far a plot may lie before its track's last update
 
 
@@ -74,7 +75,7 @@ class Gate:
         self._growth = settings.degraded_noise**2
         self._accel, self._accel_time = max(filters.accel_h), filters.accel_time
         self._turn = float(np.radians(max(filters.turn_rate, default=0.0)))
-        self._use_identity = use_identity
+        self._use_identity, self._most = use_identity, settings.most_candidates
 
     def __call__(
         self,
@@ -204,10 +205,10 @@ class Gate:
         variance = float(bounds.spread(m, index).max()) + (float(m.jitter[index].max()) * speed) ** 2
         reach = self._reach(life, rows, dt + half, variance)
         reach = reach + np.where(life.status[rows] == CONFIRMED, float(self._astray(m, index, bounds).max()), 0.0)
-        return near_pairs(position, reach + speed * half, m.position[index, :2])
+        return near_pairs(position, reach + speed * half, m.position[index, :2], _COARSE * self._most)
 
     def _close(self, pairs: Pairs, life: Lifecycle, m: Measurements, index: _Index, bounds: "_Bounds") -> Pairs:
-        """Keep the pairs that the same radius allows at the plot's own time."""
+        """Keep the pairs that the same radius allows at the plot's own time, the nearest of a track that has many."""
         track, plot = pairs.track, index[pairs.plot]
         dt = m.time[plot] - life.time[track]
         velocity = life.mean[track][:, _VELOCITY[:2]]
@@ -217,15 +218,20 @@ class Gate:
         reach = reach + np.where(life.status[track] == CONFIRMED, self._astray(m, plot, bounds), 0.0)
         nu = m.position[plot, :2] - position
         keep = np.linalg.norm(nu, axis=-1) <= reach
-        seeds = np.flatnonzero(keep & (life.status[track] == SEED))
-        keep[seeds] = self._within(nu[seeds], life.cov[track[seeds]], bounds.growth * m.cov[plot[seeds]], dt[seeds])
+        seed = life.status[track] == SEED
+        many = np.bincount(track[keep], minlength=1 + int(track.max(initial=0)))[track] > self._most
+        weighed = np.flatnonzero(keep & (seed | many))
+        d2 = np.zeros(len(track))
+        d2[weighed] = self._apart(
+            nu[weighed], life.cov[track[weighed]], bounds.growth * m.cov[plot[weighed]], dt[weighed]
+        )
+        # The gate of a track of one plot is the widest of all, and of the hardest mode: most of its radius is outside.
+        keep &= ~seed | (d2 <= self.horizontal * (1.0 + 1e-9))
+        keep[keep] = nearest_pairs(Pairs(track[keep], pairs.plot[keep]), d2[keep], self._most)
         return Pairs(track[keep], pairs.plot[keep])
 
-    def _within(self, nu: _Array, P: _Array, R: _Array, dt: _Array) -> npt.NDArray[np.bool_]:
-        """Say which innovations (k, 2) lie inside the gate of a track at rest, which no mode but the hardest widens.
-
-        A track of one plot has the widest gate of all; among dense targets most of what its radius holds is outside.
-        """
+    def _apart(self, nu: _Array, P: _Array, R: _Array, dt: _Array) -> _Array:
+        """Squared distances, in deviations, of innovations (k, 2) of tracks that move as the hardest mode lets them."""
         S = np.zeros((len(nu), 3, 3))
         t = dt[:, None, None]
         pp, pv, vv = P[:, 0:3:2, 0:3:2], P[:, 0:3:2, 1:4:2], P[:, 1:4:2, 1:4:2]
@@ -234,8 +240,7 @@ class Gate:
             pp + t * (pv + pv.swapaxes(1, 2)) + t * t * vv + R[:, :2, :2] + hardest[:, None, None] * np.eye(2)
         )
         S[:, 2, 2] = 1.0
-        d2, _ = distances(np.column_stack([nu, np.zeros(len(nu))]), S)
-        return np.asarray(d2 <= self.horizontal * (1.0 + 1e-9))
+        return distances(np.column_stack([nu, np.zeros(len(nu))]), S)[0]
 
     def _reach(self, life: Lifecycle, rows: _Index, dt: _Array, plot_variance: float | _Array) -> _Array:
         """Radius of the gate after dt, from the last state and the hardest manoeuvre since."""

@@ -79,6 +79,8 @@ class TrackerSettings:
 
     Attributes:
         gate_probability: probability that a target's own plot falls inside its gate.
+        most_candidates: plots of a slice that one track chooses among: those nearest, in standard deviations, where its
+            gate holds more; reports of its own address are always among them.
         detection_probability: probability that a target gives a plot in a scan.
         clutter_density: false plots and new targets per m^2 and scan; a higher value makes the tracker prefer
             leaving a distant plot alone to stretching a track. Absent: a tenth of the density of the source's plots
@@ -112,6 +114,7 @@ class TrackerSettings:
     """
 
     gate_probability: float = 0.9999
+    most_candidates: int = 12
     detection_probability: float = 0.95
     clutter_density: float | None = None
     clutter_density_azimuth: float = 1.0
@@ -147,6 +150,8 @@ class TrackerSettings:
                 f"tracker.confirm_hits of confirm_scans (M of N) needs 1 <= M <= N <= 32, "
                 f"got {self.confirm_hits} of {self.confirm_scans}."
             )
+        if self.most_candidates < 1:
+            raise ModelError(f"tracker.most_candidates is a number of plots, 1 or more, got {self.most_candidates}.")
         positive = ("clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds", "split_range")
         outliers = ("split_azimuth", "outlier_azimuth", "outlier_range", "outlier_xy", "sigma_pressure")
         given = {name: getattr(self, name) for name in (*positive, *outliers)}
