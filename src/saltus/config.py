@@ -14,6 +14,7 @@ name = "BCN"                      # optional, each its own; alone, without sac a
 sigma_range = 30.0                # optional noise: m,
 sigma_azimuth = 0.08              # degrees,
 sigma_elevation = 0.3             # degrees,
+sigma_range_rate = 2.0            # m/s
 sigma_xy = 10.0                   # m (plane and geodetic positions),
 sigma_altitude = 8.0              # m
 sigma_time = 0.06                 # s (time stamps of positions)
@@ -70,6 +71,7 @@ _HINTS = {
     "sigma_range": "one standard deviation in m, above 0 and up to 10000",
     "sigma_azimuth": "one standard deviation in degrees, above 0 and up to 10",
     "sigma_elevation": "one standard deviation in degrees, above 0 and up to 10",
+    "sigma_range_rate": "one standard deviation in m/s, above 0 and up to 1000",
     "sigma_xy": "one standard deviation in m, above 0 and up to 10000",
     "sigma_altitude": "one standard deviation in m, above 0 and up to 10000",
     "sigma_time": "one standard deviation in s, 0 to 10",
@@ -108,6 +110,7 @@ class SensorConfig(BaseModel):
     sigma_range: _Sigma | None = None
     sigma_azimuth: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
     sigma_elevation: Annotated[float, Field(gt=0.0, le=10.0)] | None = None
+    sigma_range_rate: Annotated[float, Field(gt=0.0, le=1e3)] | None = None
     sigma_xy: _Sigma | None = None
     sigma_altitude: _Sigma | None = None
     sigma_time: Annotated[float, Field(ge=0.0, le=10.0)] | None = None

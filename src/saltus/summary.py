@@ -24,6 +24,7 @@ _UNITS = {
     "sigma_range_m": "σ of range, m",
     "sigma_azimuth_deg": "σ of azimuth, °",
     "sigma_elevation_deg": "σ of elevation, °",
+    "sigma_range_rate_mps": "σ of range rate, m/s",
     "sigma_xy_m": "σ of position, m",
     "sigma_time_s": "σ of time stamps, s",
 }

@@ -265,7 +265,8 @@ def measurements(time, position, ray, azimuth):
         position=np.column_stack([position, np.zeros(n)]), cov=np.broadcast_to(np.eye(3), (n, 3, 3)).copy(),
         icao24=codes, mode3a=codes.astype(np.int16), callsign=np.full(n, "", "U8"),
         polar=np.column_stack([np.hypot(*ray.T), azimuth]), ray=ray, lever=np.zeros((n, 2)),
-        elevation=blank, origin=np.full((n, 2), np.nan), bearing=blank, sigma_bearing=blank, jitter=np.zeros(n),
+        elevation=blank, range_rate=blank, sigma_range_rate=blank, origin=np.full((n, 2), np.nan), bearing=blank,
+        sigma_bearing=blank, jitter=np.zeros(n),
         inflation=np.ones(n),
     )  # fmt: skip
 

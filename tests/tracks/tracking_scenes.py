@@ -49,6 +49,8 @@ def measured(time, xy, sigma, *, altitude=None, sigma_altitude=10.0, source=0, i
         callsign=np.full(n, "", "U8"),
         polar=np.full((n, 2), np.nan),
         elevation=np.full(n, np.nan),
+        range_rate=np.full(n, np.nan),
+        sigma_range_rate=np.ones(n),
         ray=np.full((n, 2), np.nan),
         lever=np.zeros((n, 2)),
         origin=np.full((n, 2), np.nan),

@@ -35,7 +35,7 @@ __all__ = ["SCHEMA", "Journal", "foreign_columns"]
 
 _Array = npt.NDArray[Any]
 
-SCHEMA = 1
+SCHEMA = 2
 _ROWS = 1 << 16  # of a segment
 _FOREIGN = ("time", "track_number", "latitude", "longitude", "vx", "vy", "coasted")
 

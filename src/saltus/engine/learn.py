@@ -36,8 +36,11 @@ SIGMAS = {  # by what a source reports: label, field of Noise, unit
 
 def sigmas(sensor: SensorSetup) -> tuple[tuple[str, str, float], ...]:
     """Return the standard deviations that say how good the reports of a source are: label, field of Noise, unit."""
-    measured = sensor.kind == Kind.POLAR and sensor.elevations
-    return SIGMAS[sensor.kind] + ((("sigma_elevation_deg", "elevation", 180.0 / np.pi),) if measured else ())
+    others = {"sigma_elevation_deg": ("elevation", 180.0 / np.pi), "sigma_range_rate_mps": ("range_rate", 1.0)}
+    measured = (sensor.elevations, sensor.range_rates) if sensor.kind == Kind.POLAR else (False, False)
+    return SIGMAS[sensor.kind] + tuple(
+        (k, *v) for (k, v), is_told in zip(others.items(), measured, strict=True) if is_told
+    )
 
 
 def usable(plots: Plots, sites: Sequence[Site | None]) -> npt.NDArray[np.bool_]:
@@ -100,6 +103,7 @@ def _sensor(
         wait=max(used, source.traits.rest_period),
         kind=_kind(source, own.kind),
         elevations=bool(np.isfinite(own.elevation[own.kind == Kind.POLAR]).any()),
+        range_rates=bool(np.isfinite(own.range_rate[own.kind == Kind.POLAR]).any()),
         heard=len(own) > 0,
         noise=replace(default_noise(source), **given),
         estimate=_UNKNOWN,

@@ -67,6 +67,7 @@ class _Sensor(BaseModel):
     wait: _Seconds
     kind: Literal["polar", "plane", "bearing"]
     elevations: bool
+    range_rates: bool = False
     heard: bool
     noise: Annotated[Noise, AfterValidator(_sane)]
     estimate: NoiseEstimate
@@ -173,6 +174,7 @@ def _sensor(learnt: _Sensor, config: Config) -> SensorSetup:
         wait=learnt.wait if set_period is None else max(period, source.traits.rest_period),
         kind=_KINDS[learnt.kind],
         elevations=learnt.elevations,
+        range_rates=learnt.range_rates,
         heard=learnt.heard,
         noise=dataclasses.replace(learnt.noise, **given),
         estimate=learnt.estimate,

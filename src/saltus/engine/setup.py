@@ -35,6 +35,7 @@ class SensorSetup:
     wait: float  # s without a report after which a target counts as missed
     kind: int  # what it reports: `Kind.POLAR`, `Kind.PLANE` (any position) or `Kind.BEARING`
     elevations: bool  # whether it measures these, too
+    range_rates: bool  # and these
     heard: bool  # whether it gave a usable report in what the setup was learnt from
     noise: Noise  # used
     estimate: NoiseEstimate  # found in the first stretch
@@ -103,6 +104,7 @@ def given_noise(sensor: SensorConfig | None, period: float) -> dict[str, float]:
         "range": sensor.sigma_range,
         "azimuth": azimuth,
         "elevation": elevation,
+        "range_rate": sensor.sigma_range_rate,
         "xy": sensor.sigma_xy,
         "altitude": sensor.sigma_altitude,
         "time": 0.0 if sensor.sigma_time is None and sensor.sigma_xy is not None else sensor.sigma_time,

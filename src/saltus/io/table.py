@@ -6,7 +6,7 @@ Columns, by name; others are passed over, named and counted:
     range_m         slant range, m, with
     azimuth_deg     degrees from north, clockwise, 0 to 360 (or -180 to 180); from the bow where heading_deg is given
     elevation_deg   degrees above the horizontal, -90 to 90, if measured
-    range_rate_mps  m/s, positive going away; kept with the report, not used by the tracker
+    range_rate_mps  m/s, positive going away; used with range and azimuth
     x_m, y_m, z_m   m east and north (and up, if measured) of the sensor's site, whatever the heading
     latitude, longitude  (or lat, lon)  degrees, WGS-84
     kind            polar, plane, geodetic or bearing: which of these the row means, where it gives several

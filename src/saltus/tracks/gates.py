@@ -11,6 +11,7 @@ from saltus.tracks.identity import conflicting
 from saltus.tracks.kinematics import Kinematics, Plan
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
 from saltus.tracks.measurements import Measurements
+from saltus.tracks.range_rate import with_range_rates
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
 __all__ = ["Ahead", "Gate", "Gated", "distances", "predict"]
@@ -76,6 +77,10 @@ class Gate:
         self._accel, self._accel_time = max(filters.accel_h), filters.accel_time
         self._turn = float(np.radians(max(filters.turn_rate, default=0.0)))
         self._use_identity, self._most = use_identity, settings.most_candidates
+        # Against any rate that a target may have; one left out is wrong, whoever's the plot is.
+        self._rates = np.log(
+            [2.0 * settings.max_speed * (1.0 - settings.range_rate_outlier), settings.range_rate_outlier]
+        )
 
     def __call__(
         self,
@@ -141,11 +146,16 @@ class Gate:
         _, d2_height = distances(ahead.nu[inside], ahead.S[inside])
         height_used = np.isfinite(position[:, 2]) & (d2_height <= self.height)
         position[~height_used, 2] = np.nan
+        plan, log_scale = Plan.of_positions(position, offset), np.zeros(len(inside))
+        covs = (source.law.covariances(m, plot) + late[:, None]) * m.inflation[plot, None, None, None] + extra[:, None]
+        if np.isfinite(m.range_rate[plot]).any():
+            plan, covs, used = with_range_rates(plan, covs, ahead.copies, inside, m, plot, self.height)
+            log_scale += np.where(np.isnan(m.range_rate[plot]), 0.0, np.where(used, *self._rates))
         return Gated(
             Pairs(pairs.track[inside], pairs.plot[inside]),
-            Plan.of_positions(position, offset),
-            (source.law.covariances(m, plot) + late[:, None]) * m.inflation[plot, None, None, None] + extra[:, None],
-            np.zeros(len(inside)),
+            plan,
+            covs,
+            log_scale,
             ahead.centre[inside],
             ahead.S[inside, :2, :2],
             d2,

@@ -34,6 +34,7 @@ _Array = npt.NDArray[np.float64]
 # Where nothing is configured and nothing could be estimated: a monopulse secondary radar, an airport
 # multilateration, ADS-B with good satellite navigation, heights in steps of 100 ft.
 _RANGE, _AZIMUTH, _ELEVATION, _XY, _ALTITUDE = 50.0, np.radians(0.08), np.radians(0.3), 20.0, 10.0
+_RANGE_RATE = 3.0
 _GROUND_RELIEF = 20.0  # m
 _SMALLEST_AREA = 1e6  # m^2
 _HULL, _RESOLUTION = 75.0, 15.0  # m, and in standard deviations: how far two plots of one target differ
@@ -42,7 +43,7 @@ _SAME_HEIGHT = 60.0  # m: reports of one target in one scan differ by less
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Standard deviations of one source's measurements: m, rad and s, each report's error by itself.
+    """Standard deviations of one source's measurements: m, rad, m/s and s, each report's error by itself.
 
     `time` is that of the time stamps: a position is where the target was a little sooner or later.
     `inflation` multiplies their squares where a report updates a filter: errors that last from report to report tell
@@ -54,6 +55,7 @@ class Noise:
     elevation: float = float(_ELEVATION)
     xy: float = _XY
     altitude: float = _ALTITUDE
+    range_rate: float = _RANGE_RATE
     time: float = 0.0
     inflation: float = 1.0
 
@@ -68,6 +70,7 @@ def default_noise(source: Source) -> Noise:
         elevation=float(max(_ELEVATION, source.elevation_lsb / step)),
         xy=max(_XY, source.xy_lsb / step),
         altitude=max(_ALTITUDE, source.altitude_lsb / step),
+        range_rate=max(_RANGE_RATE, source.range_rate_lsb / step),
         time=max(source.traits.sigma_time, source.time_lsb / step),
     )
 
@@ -86,6 +89,8 @@ class Measurements:
     callsign: npt.NDArray[Any]  # "" none
     polar: _Array  # (N, 2): slant range (m) and azimuth (rad) where the source measures them, else NaN
     elevation: _Array  # (N,): rad where the height comes from one, else NaN
+    range_rate: _Array  # (N,): m/s, positive going away; NaN where it is not measured
+    sigma_range_rate: _Array  # (N,): m/s
     ray: _Array  # (N, 2): from the site to the position in the plane, m; NaN where the source is not polar
     lever: _Array  # (N, 2): change of plane position per metre of height error, 0 where none
     origin: _Array  # (N, 2): plane x, y of the observer of a bearing, m; NaN where there is a position instead
@@ -248,16 +253,21 @@ def place_plots(
         callsign=plots.callsign[usable].astype("U8"),
         polar=np.stack([plots.range[usable], plots.azimuth[usable]], axis=-1),
         elevation=np.where(plots.kind[usable] == Kind.POLAR, plots.elevation[usable], np.nan),
+        range_rate=np.where(np.isnan(ray[:, 0]), np.nan, plots.range_rate[usable]),
+        sigma_range_rate=_of_sources(plots.source[usable], noise, "range_rate"),
         ray=ray,
         lever=lever,
         origin=sights[:, :2],
         bearing=sights[:, 2],
         sigma_bearing=sights[:, 3],
-        jitter=np.where(
-            np.isnan(ray[:, 0]), np.array([noise[s].time for s in range(len(plots.sources))])[plots.source[usable]], 0.0
-        ),
-        inflation=np.array([noise[s].inflation for s in range(len(plots.sources))])[plots.source[usable]],
+        jitter=np.where(np.isnan(ray[:, 0]), _of_sources(plots.source[usable], noise, "time"), 0.0),
+        inflation=_of_sources(plots.source[usable], noise, "inflation"),
     )
+
+
+def _of_sources(source: npt.NDArray[np.int32], noise: Mapping[int, Noise], name: str) -> _Array:
+    """A deviation of the source of each report."""
+    return np.array([getattr(noise[s], name) for s in range(len(noise))])[source]
 
 
 def _site(plots: Plots, site: Site | None) -> Site | Sites | None:

@@ -37,6 +37,7 @@ class NoiseEstimate(NamedTuple):
     time: float  # s, of the time stamps of such sources
     n_windows: int
     elevation: float = float("nan")  # rad
+    range_rate: float = float("nan")  # m/s
 
 
 def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int) -> NoiseEstimate:
@@ -47,7 +48,7 @@ def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int
     acceleration the target has. Along and across the ray from the radar, sigma is the root mean square of
     e / sqrt(1 - h) over all straight windows, those beyond four median deviations (outliers, turns) left out. Of
     positions, sigma is found across the course, and from what is more along it the deviation of time stamps tau:
-    mean e^2 = sigma^2 + tau^2 v^2. Elevations are taken as they are, without the range errors in their heights.
+    mean e^2 = sigma^2 + tau^2 v^2. Elevations and range rates are taken as they are, by quadratics of their own.
 
     Args:
         m: measurements in time order.
@@ -86,15 +87,18 @@ def _estimated(
         straight = moving
     middle = window[whole, _WINDOW // 2][straight]
     found = _scatter(residual[straight], velocity[straight], m.ray[middle])
-    return found._replace(elevation=_of_elevations(m, window[whole][straight], time[whole][straight]))
+    window, time = window[whole][straight], time[whole][straight]
+    return found._replace(
+        elevation=_of_values(m.elevation[window], time), range_rate=_of_values(m.range_rate[window], time)
+    )
 
 
-def _of_elevations(m: Measurements, window: npt.NDArray[np.intp], time: _Array) -> float:
-    """Return the standard deviation of elevations, rad; NaN where too few are measured."""
-    measured = np.isfinite(m.elevation[window]).all(axis=1)
+def _of_values(values: _Array, time: _Array) -> float:
+    """Return the standard deviation of what windows measure beside positions, (W, 7); NaN where too few do."""
+    measured = np.isfinite(values).all(axis=1)
     if measured.sum() < _MIN_WINDOWS:
         return np.nan
-    residual, *_ = _middle_residuals(time[measured], m.elevation[window[measured]][..., None])
+    residual, *_ = _middle_residuals(time[measured], values[measured][..., None])
     return float(_MAD * np.median(np.abs(residual)))  # climbs begin and end within the windows of some tracks
 
 
@@ -160,6 +164,7 @@ def apply_estimate(noise: Noise, estimate: NoiseEstimate, source: Source) -> Noi
         range=at_least(estimate.range, source.range_lsb, noise.range),
         azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth, LEAST / _AT),
         elevation=at_least(estimate.elevation, source.elevation_lsb, noise.elevation),
+        range_rate=at_least(estimate.range_rate, source.range_rate_lsb, noise.range_rate),
         xy=at_least(estimate.xy, source.xy_lsb, noise.xy),
         time=estimate.time if np.isfinite(estimate.time) else noise.time,
     )

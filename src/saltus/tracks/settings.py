@@ -98,6 +98,7 @@ class TrackerSettings:
             range is 75 m, 15 standard deviations of the plot and the way flown in between, if that is less.
         split_azimuth: see split_range.
         altitude_outlier: probability that a plot's height is wrong (garbled Mode C); such a height is ignored.
+        range_rate_outlier: probability that a plot's range rate is wrong (folded by ambiguity); such a rate is ignored.
         plot_outlier: probability that a radar plot's azimuth is faulty, and its range, or the position of another
             sensor, each plot by itself; 0 = none is. A plot outside the gate of a confirmed track, or of one of its
             own address, may still be taken for such a fault, with the deviations below.
@@ -126,6 +127,7 @@ class TrackerSettings:
     split_range: float = 300.0
     split_azimuth: float = 3.0
     altitude_outlier: float = 1e-3
+    range_rate_outlier: float = 1e-2
     plot_outlier: float = 1e-3
     outlier_azimuth: float = 1.5
     outlier_range: float = 400.0
@@ -137,7 +139,7 @@ class TrackerSettings:
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""
-        for name in ("gate_probability", "detection_probability", "altitude_outlier"):
+        for name in ("gate_probability", "detection_probability", "altitude_outlier", "range_rate_outlier"):
             value = getattr(self, name)
             if not 0.0 < value < 1.0:
                 raise ModelError(f"tracker.{name} is a probability between 0 and 1, got {value}.")
