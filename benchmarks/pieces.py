@@ -5,7 +5,8 @@
 Each FOLDER holds recordings (.ast, .pcap) and sensors.toml. They are tracked in one piece, in pieces of 1 000 and of
 50 000 reports, in pieces of one report in their first five minutes, and by runs that are killed (SIGKILL) at random
 moments and resumed until they come through. Prints which of tracks.parquet, assignments.parquet,
-identifications.parquet and biases.json differ from those of the one piece.
+identifications.parquet and biases.json differ from those of the one piece. Of a run that ends in the middle it prints
+how many rows of the whole one that were known by then are in it, unchanged (but for `time_to` of identifications).
 """
 
 import argparse
@@ -20,6 +21,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 TABLES = ("tracks.parquet", "assignments.parquet", "identifications.parquet", "biases.json")
 _MINUTES = 300.0  # s of data fed one by one
@@ -56,12 +59,43 @@ def _compared(folder: Path, kills: int, rng: np.random.Generator) -> list[tuple[
             _track([*inputs, "-o", f"{place}/{chunk}", "--chunk", chunk])
             out.append((f"--chunk {chunk}", _different(whole, Path(place) / chunk)))
         start = json.loads((whole / "summary.json").read_text())["time_from"]
+        out.append(("ended in the middle", _changed(inputs, whole, Path(place) / "half")))
         end = datetime.fromtimestamp(start + _MINUTES, UTC).isoformat()
         _track([*inputs, "-o", f"{place}/short", "--to", end])
         _track([*inputs, "-o", f"{place}/ones", "--to", end, "--chunk", "1"])
         out.append(("five minutes, --chunk 1", _different(Path(place) / "short", Path(place) / "ones")))
         out.append((f"killed {kills} times and resumed", sorted(_killed(inputs, whole, kills, seconds, rng))))
     return out
+
+
+def _changed(inputs: Sequence[str], whole: Path, half: Path) -> list[str]:
+    """Track up to the middle; return what was known by then and is otherwise, with the shares that stay."""
+    told = json.loads((whole / "summary.json").read_text())
+    middle = 0.5 * (told["time_from"] + told["time_to"])
+    _track([*inputs, "-o", str(half), "--to", datetime.fromtimestamp(middle, UTC).isoformat()])
+    out = []
+    for name in ("tracks", "identifications"):
+        early, then = (_known(folder / f"{name}.parquet", middle) for folder in (whole, half))
+        print(f"  {name}: {len(early & then)} of {len(early)} rows known by the middle stay", flush=True)
+        if early - then:
+            out.append(f"{name}.parquet")
+    return out
+
+
+def _known(path: Path, time: float) -> set[tuple[object, ...]]:
+    """Rows known before a time."""
+    table = pq.read_table(path)
+    table = table.filter(pc.less(table["time_known"], time))
+    return set(
+        zip(
+            *(
+                column.to_pylist()
+                for name, column in zip(table.column_names, table.columns, strict=True)
+                if name != "time_to"
+            ),
+            strict=True,
+        )
+    )
 
 
 def _killed(inputs: Sequence[str], whole: Path, kills: int, seconds: float, rng: np.random.Generator) -> set[str]:

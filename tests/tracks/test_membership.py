@@ -5,16 +5,25 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from saltus.identify import Episodes
-from saltus.tracks.membership import Local, Merger, known_since, segments
+from saltus.tracks.membership import Local, Membership, Merger, known_since
+
+DEATH, PART, BIRTH, JOIN = range(4)  # the order of what becomes known at one time
 
 
-def episodes(*rows):
-    """Rows (a, b, time_from, time_to, probability[, since[, until]])."""
-    full = [(*r, *(-np.inf, r[3])[len(r) - 5 :]) for r in rows]
-    columns = zip(*full, strict=True) if full else ((),) * 7
-    kinds = (np.int64, np.int64, *(float,) * 5)
-    return Episodes(*(np.array(column, kind) for column, kind in zip(columns, kinds, strict=True)))
+def events(tracks, ready, end, rows):
+    """Deaths, partings, births and joins; rows are (a, b, time_from, time_to, probability[, since[, until]])."""
+    for k, track in enumerate(tracks):
+        if np.isfinite(ready[k]):
+            yield ready[k], BIRTH, k, (k, track, ready[k])
+            yield end[k], DEATH, k, (k, end[k])
+    for r in rows:
+        a, b, start, stop, p, since, until = map(float, (*r, *(-np.inf, r[3])[len(r) - 5 :]))
+        a, b = int(a), int(b)
+        if stop >= max(ready[a], ready[b]):
+            known = max(start, ready[a], ready[b])
+            yield known, JOIN, a, (a, b, since, known, p)
+            if stop < min(end[a], end[b]):  # both live on: a change of mind
+                yield max(stop, known), PART, a, (a, b, until, max(stop, known))
 
 
 def cut(begin, end, *rows, ready=None, system=None, address=None, foreign=None):
@@ -22,7 +31,11 @@ def cut(begin, end, *rows, ready=None, system=None, address=None, foreign=None):
     columns = (begin, system or range(n), address or [-1] * n, foreign or [False] * n)
     tracks = [Local(float(b), s, a, f) for b, s, a, f in zip(*columns, strict=True)]
     ready = np.array(begin, float) + 3.0 if ready is None else np.array(ready, float)
-    found, membership = segments(tracks, ready, np.array(end, float), episodes(*rows))
+    membership = Membership()
+    does = (membership.death, membership.part, membership.birth, membership.join)
+    for _, kind, _, given in sorted(events(tracks, ready.tolist(), [float(e) for e in end], rows), key=lambda e: e[:3]):
+        does[kind](*given)
+    found = membership.segments(np.array(end, float))
     out = {}
     for k, *row in zip(*found, strict=True):
         out.setdefault(int(k), []).append(tuple(float(v) for v in row))

@@ -244,7 +244,7 @@ def test_corrections_undo_the_biases():
     m = measurements(np.arange(n, dtype=float), position + bias[:2], ray, np.radians(5.0) + np.arctan2(*ray.T))
     series = BiasSeries(
         time=np.array([10.0]), mean=bias[None], cov=np.zeros((1, 6, 6)), estimated=np.ones((1, 6), bool),
-        scatter=np.zeros(1), objects=np.ones(1, int), prior=np.ones(6),
+        scatter=np.zeros(1), objects=np.ones(1, int), excess=np.zeros(1), prior=np.ones(6),
     )  # fmt: skip
     own = np.arange(0, n, 2)
     fixed = corrected(m, own, series)

@@ -9,12 +9,12 @@ import pytest
 from saltus.identify import LocalTracks
 from saltus.run import track_files
 from saltus.tracks.encounters import SystemTracks
-from saltus.tracks.identities import identify
 from saltus.tracks.local import LocalSystem
 from saltus.tracks.membership import Segments
-from saltus.tracks.settings import FilterSettings, SystemsSettings
-from saltus.tracks.splits import second_echoes, split_evidence
-from saltus.tracks.systems import Registered, pairing_settings
+from saltus.tracks.picture import Picture
+from saltus.tracks.settings import FilterSettings, RegistrationSettings, SystemsSettings
+from saltus.tracks.splits import echo_rows, second_echoes
+from saltus.tracks.systems import Region, pairing_settings
 
 
 def radar(*ways, sigma=3.0, seed=0, polar=True):
@@ -29,9 +29,8 @@ def radar(*ways, sigma=3.0, seed=0, polar=True):
     ray = position if polar else np.full_like(position, np.nan)
     view = SystemTracks(LocalTracks(track, time, position, R), velocity, ray, np.full(n, -1))
     nothing = np.full(n, -1)
-    return LocalSystem(
-        "radar", view, nothing, ("",) * n, np.full(n, 3.0), np.arange(1, n + 1), np.arange(len(track)), sigma
-    )
+    ids, rows, codes = np.arange(1, n + 1), np.arange(len(track)), np.full((len(track), 2), -1)
+    return LocalSystem("radar", view, nothing, ("",) * n, np.full(n, 3.0), ids, rows, sigma, time, codes)
 
 
 def taxiing(x, y, speed=8.0):
@@ -49,6 +48,14 @@ def parked(x, y):
     return lambda t: (np.tile([x, y], (len(t), 1)), np.zeros((len(t), 2)))
 
 
+def looked_at(system, until=120.0):
+    """Look at a radar alone every ten seconds."""
+    picture = Picture(["radar"], [0], [1.0], SystemsSettings(), RegistrationSettings(), FilterSettings())
+    for now in np.arange(10.0, until + 1.0, 10.0).tolist():
+        picture.look(now, [system])
+    return picture
+
+
 def test_echoes_that_go_together_are_one_object_and_neighbours_are_not():
     system = radar(
         taxiing(-800.0, 300.0),
@@ -58,7 +65,7 @@ def test_echoes_that_go_together_are_one_object_and_neighbours_are_not():
         parked(525.0, -400.0),  # beside it
         taxiing(-700.0, 1500.0, 12.0),
     )
-    found, _ = identify([system], [Registered("radar", "", None)], SystemsSettings(), FilterSettings())
+    found = looked_at(system).decisions()
     pairs = set(zip(found.episodes.a.tolist(), found.episodes.b.tolist(), strict=True))
     assert pairs == {(0, 1)}
     assert found.episodes.probability.min() > 0.999
@@ -66,9 +73,10 @@ def test_echoes_that_go_together_are_one_object_and_neighbours_are_not():
 
 def test_only_radars_have_second_echoes():
     ways = taxiing(-800.0, 300.0), taxiing(-780.0, 310.0)
-    assert split_evidence(radar(*ways), SystemsSettings(), FilterSettings()) is not None
-    assert split_evidence(radar(*ways, polar=False), SystemsSettings(), FilterSettings()) is None
-    assert split_evidence(radar(parked(0.0, 300.0), parked(20.0, 300.0)), SystemsSettings(), FilterSettings()) is None
+    assert len(echo_rows(radar(*ways).view, own=True).time)
+    assert not len(echo_rows(radar(*ways).view, own=False).time)
+    assert not len(echo_rows(radar(*ways, polar=False).view, own=True).time)
+    assert not len(echo_rows(radar(parked(0.0, 300.0), parked(20.0, 300.0)).view, own=True).time)
 
 
 def test_the_later_of_two_tracks_of_one_system_is_the_echo():
@@ -134,10 +142,11 @@ def test_a_second_echo_belongs_to_the_track_and_does_not_move_it(aerodrome):
 
 def test_objects_move_as_the_filters_say():
     """Levels of acceleration as configured; a turn and the hardest of them are one manoeuvre."""
-    system = radar(parked(0.0, 300.0))
-    found = pairing_settings([system], SystemsSettings(), FilterSettings(), 0.0)
+    region = Region()
+    region.add(radar(parked(0.0, 300.0)).view.tracks.z)
+    found = pairing_settings([region], SystemsSettings(), FilterSettings(), 0.0)
     assert (found.accel, found.sojourn, found.accel_time) == ((0.15, 3.0), (150.0, 25.0), 4.0)
     boats = FilterSettings(accel_h=(0.01, 0.1, 0.5), sojourn_h=(60.0, 30.0, 20.0), turn_rate=(), accel_time=0.0)
-    found = pairing_settings([system], SystemsSettings(), boats, 0.0)
+    found = pairing_settings([region], SystemsSettings(), boats, 0.0)
     assert (found.accel, found.sojourn, found.accel_time) == ((0.01, 0.1, 0.5), (60.0, 30.0, 20.0), 4.0)
-    assert pairing_settings([system], SystemsSettings(), FilterSettings(accel_time=2.0), 0.0).accel_time == 2.0
+    assert pairing_settings([region], SystemsSettings(), FilterSettings(accel_time=2.0), 0.0).accel_time == 2.0

@@ -1,28 +1,36 @@
 """Who is whom among several systems: local tracks registered, identified, joined into system tracks."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.config import Config
 from saltus.engine.setup import Setup
 from saltus.errors import ModelError
 from saltus.identify import Decisions, Episodes, Evidence, join_evidence
 from saltus.records import Plots
 from saltus.tracks.bias import PARAMETERS
-from saltus.tracks.identities import identify
 from saltus.tracks.local import LocalSystem, Party, foreign_systems, local_system
-from saltus.tracks.membership import Change, Local, Merger, Segments, known_since, segments
+from saltus.tracks.membership import Change, Merger, Segments, known_since
+from saltus.tracks.picture import Picture
 from saltus.tracks.rows import Tracked, join_rows
-from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.system_tracks import Part, track_systems
-from saltus.tracks.systems import Registered, lasting_difference, register_all
+from saltus.tracks.systems import Registered, order_of_trust
 
-__all__ = ["IDENTIFICATIONS", "Identified", "bias_tables", "identification_table", "published_tracks", "together"]
+__all__ = [
+    "IDENTIFICATIONS",
+    "Identified",
+    "bias_tables",
+    "identification_table",
+    "local_systems",
+    "published_tracks",
+    "refuse_reference",
+    "together",
+    "trusted",
+]
 
 
 _TEXT, _NUMBER, _TIME = pa.string(), pa.int64(), pa.float64()
@@ -67,7 +75,18 @@ def together(
         plots: all reports; `Measurements.plot` are places in it.
         foreign: another centre's tracks, never part of a state.
     """
-    use_identity, config = setup.use_identity, setup.config
+    local = local_systems(setup, tracked, plots, foreign)
+    refuse_reference(setup, [system.name for system in local])
+    if len(local) == 1:
+        return _single(local[0]), next(iter(tracked.values()))
+    whole = _identified(local, list(tracked), setup)
+    return whole, _joined(tracked, whole, setup)
+
+
+def local_systems(
+    setup: Setup, tracked: Mapping[Party, Tracked], plots: Plots, foreign: pa.Table | None
+) -> list[LocalSystem]:
+    """Return the local tracks of all systems, another centre's behind those with measurements."""
     local = [
         local_system(
             party.name,
@@ -75,17 +94,11 @@ def together(
             t.assignments,
             join_rows(t.rows),
             plots.local_id[t.measurements.plot],
-            use_identity=use_identity,
+            use_identity=setup.use_identity,
         )
         for party, t in tracked.items()
     ]
-    if foreign is not None and len(foreign):
-        local += _foreign(foreign, setup, plots)
-    reference = _reference(setup, list(tracked), [system.name for system in local])
-    if len(local) == 1:
-        return _single(local[0]), next(iter(tracked.values()))
-    whole = _identified(local, replace(config.systems, reference=reference), config)
-    return whole, _joined(tracked, whole, setup)
+    return local + (_foreign(foreign, setup, plots) if foreign is not None and len(foreign) else [])
 
 
 def _foreign(tracks: pa.Table, setup: Setup, plots: Plots) -> list[LocalSystem]:
@@ -120,34 +133,65 @@ def _single(system: LocalSystem) -> Identified:
     return Identified([system], alone, lives, (), (), Decisions(nobody, ()), join_evidence([]))
 
 
-def _reference(setup: Setup, parties: Sequence[Party], systems: Sequence[str]) -> str:
-    """Return the system that the configuration calls its reference, by its name or that of one of its sensors."""
+def refuse_reference(setup: Setup, systems: Sequence[str]) -> None:
+    """Refuse a reference that is none of the systems, those of the setup and others named.
+
+    Raises:
+        ModelError: it names none.
+    """
     told = setup.config.systems.reference
-    if not told or told in systems:
-        return told
-    of_sensor = {setup.sensors[s].name: party.name for party in parties for s in party.sources}
-    if told not in of_sensor:
-        known = ", ".join(dict.fromkeys([*systems, *of_sensor]))
-        raise ModelError(f"systems.reference = {told!r} names none of the systems in the inputs: {known}.")
-    return of_sensor[told]
+    known = dict.fromkeys([*(p.name for p in setup.parties()), *systems, *(s.name for s in setup.sensors)])
+    if told and told not in known:
+        raise ModelError(f"systems.reference = {told!r} names none of the systems in the inputs: {', '.join(known)}.")
 
 
-def _identified(local: Sequence[LocalSystem], settings: SystemsSettings, config: Config) -> Identified:
-    registered, how = register_all(local, settings, config.registration)
-    decisions, evidence = identify(registered, how, settings, config.filter)
-    locals_, end = [], []
-    for number, system in enumerate(local):
-        tracks = system.view.tracks
-        first = np.searchsorted(tracks.track, np.arange(len(system.ids)))
-        last = np.searchsorted(tracks.track, np.arange(len(system.ids)), side="right") - 1
-        end.append(tracks.time[last])
-        locals_ += [
-            Local(begin, number, address, not system.own)
-            for begin, address in zip(tracks.time[first].tolist(), system.view.icao24.tolist(), strict=True)
-        ]
-    ready = np.concatenate([s.ready for s in local])
-    lives, membership = segments(locals_, ready, np.concatenate(end), decisions.episodes)
-    return Identified(registered, how, lives, membership.mergers, membership.changes, decisions, evidence)
+def trusted(setup: Setup, systems: Sequence[LocalSystem]) -> tuple[str, ...]:
+    """Return the names of systems, the reference first, the most trusted next."""
+    told = setup.config.systems.reference
+    of_sensor = {setup.sensors[s].name: party.name for party in setup.parties() for s in party.sources}
+    names = [system.name for system in systems]
+    order = order_of_trust(systems, told if told in names else of_sensor.get(told, told))
+    return tuple(names[k] for k in order)
+
+
+def _identified(local: Sequence[LocalSystem], parties: Sequence[Party], setup: Setup) -> Identified:
+    config, names = setup.config, [system.name for system in local]
+    order = sorted(range(len(names)), key=lambda k: setup.order.index(names[k]) if names[k] in setup.order else np.inf)
+    periods = [min(setup.sensors[s].period for s in p.sources if setup.sensors[s].heard) for p in parties]
+    periods += [config.systems.track_memory] * (len(local) - len(parties))
+    picture = Picture(names, order, periods, config.systems, config.registration, config.filter)
+    every = config.systems.every
+    times = [system.known for system in local if len(system.known)]
+    if times:
+        first, last = (np.floor(f(f(t) for t in times) / every) for f in (min, max))
+        for k in np.arange(first + 1.0, last + 1.0).tolist():
+            picture.look(k * every, local)
+    picture.close(local)
+    return _found(local, picture)
+
+
+def _found(local: Sequence[LocalSystem], picture: Picture) -> Identified:
+    """Return what a picture found, with local tracks numbered through all systems in their order."""
+    first = np.cumsum([0, *(len(system.ids) for system in local)])
+    place = {(k, own): first[k] + at for k, s in enumerate(local) for at, own in enumerate(s.ids.tolist())}
+    number = np.array([place[key] for key in picture.number], np.int64)
+    end = np.array([s.view.tracks.time[s.view.tracks.track == at].max() for s in local for at in range(len(s.ids))])
+    members, decisions, evidence = picture.membership, picture.decisions(), picture.evidence()
+    lives = members.segments(end[number])
+    order = np.lexsort((lives.time_from, number[lives.track])) if len(lives.track) else np.zeros(0, np.int64)
+    e = decisions.episodes
+    return Identified(
+        list(local),
+        picture.registered(),
+        Segments(*(column[order] for column in lives._replace(track=number[lives.track]))),
+        [m._replace(track=int(number[m.track])) for m in members.mergers],
+        members.changes,
+        Decisions(
+            e._replace(a=number[e.a], b=number[e.b]),
+            tuple(c._replace(a=int(number[c.a]), b=int(number[c.b])) for c in decisions.conflicts),
+        ),
+        evidence._replace(pairs=number[evidence.pairs]),
+    )
 
 
 def _joined(tracked: Mapping[Party, Tracked], whole: Identified, setup: Setup) -> Tracked:
@@ -155,13 +199,8 @@ def _joined(tracked: Mapping[Party, Tracked], whole: Identified, setup: Setup) -
         Part(system, how, t.measurements, t.assignments, join_rows(t.rows), np.array(party.sources))
         for system, how, (party, t) in zip(whole.systems, whole.registered, tracked.items(), strict=False)
     ]
-    lasting = max(
-        [lasting_difference(a, b) for a in whole.registered for b in whole.registered if a is not b], default=0.0
-    )
     waits, config = [s.wait for s in setup.sensors], setup.config
-    found = track_systems(
-        parts, whole.segments, lasting, config.filter, config.tracker, waits, use_identity=setup.use_identity
-    )
+    found = track_systems(parts, whole.segments, config.filter, config.tracker, waits, use_identity=setup.use_identity)
     rows = found.rows
     known = np.maximum(rows.time_known, known_since(whole.changes, rows.track_id, rows.time))
     return Tracked([rows._replace(time_known=known)], found.measurements, found.assignments)

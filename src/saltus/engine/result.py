@@ -8,7 +8,15 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from saltus.engine.identified import Identified, bias_tables, identification_table, together
+from saltus.engine.identified import (
+    Identified,
+    bias_tables,
+    identification_table,
+    local_systems,
+    refuse_reference,
+    together,
+    trusted,
+)
 from saltus.engine.journal import Journal
 from saltus.engine.setup import Setup
 from saltus.records import Plots
@@ -20,7 +28,7 @@ from saltus.tracks.noise import estimate_noise
 from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.rows import ConditionFound, Fates, Rows, Tracked, assignments, join_rows
 
-__all__ = ["Result", "finished"]
+__all__ = ["Result", "finished", "order_of_systems"]
 
 _Index = npt.NDArray[np.int64]
 
@@ -52,9 +60,7 @@ def finished(journal: Journal, setup: Setup, files: Sequence[str], health: dict[
         files: names of the files that reports came from.
         health: as told last.
     """
-    plots = _reports(journal, setup, files)
-    parties = [p for p in setup.parties() if any(setup.sensors[s].heard for s in p.sources)]
-    tracked = {party: t for party in parties if (t := _tracked(journal, setup, party)) is not None}
+    plots, tracked = _reports(journal, setup, files), _all_tracked(journal, setup)
     foreign = journal.all("foreign")
     whole, joined = together(setup, tracked, plots, None if foreign is None else pa.table(foreign))
     setup = _with_estimates(setup, tracked)
@@ -71,6 +77,23 @@ def finished(journal: Journal, setup: Setup, files: Sequence[str], health: dict[
         tracked=joined,
         whole=whole,
     )
+
+
+def order_of_systems(journal: Journal, setup: Setup, files: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the systems heard so far, the reference first, the most trusted next.
+
+    Raises:
+        ModelError: the configured reference is none of them.
+    """
+    plots, tracked, foreign = _reports(journal, setup, files), _all_tracked(journal, setup), journal.all("foreign")
+    local = local_systems(setup, tracked, plots, None if foreign is None else pa.table(foreign))
+    refuse_reference(setup, [system.name for system in local])
+    return trusted(setup, local)
+
+
+def _all_tracked(journal: Journal, setup: Setup) -> dict[Party, Tracked]:
+    parties = [p for p in setup.parties() if any(setup.sensors[s].heard for s in p.sources)]
+    return {party: t for party in parties if (t := _tracked(journal, setup, party)) is not None}
 
 
 def _with_estimates(setup: Setup, tracked: Mapping[Party, Tracked]) -> Setup:

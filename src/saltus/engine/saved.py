@@ -80,6 +80,7 @@ class _Learnt(BaseModel):
     version: Literal[1]
     time: Annotated[float, Field(allow_inf_nan=False)]
     plane: tuple[float, float]
+    order: list[str] = []
     sensor: Annotated[list[_Sensor], Field(min_length=1)]
 
 
@@ -100,6 +101,7 @@ def setup_toml(setup: Setup, files: Sequence[str]) -> str:
         "version": _VERSION,
         "time": setup.time,
         "plane": [setup.plane.latitude, setup.plane.longitude],
+        "order": list(setup.order),
         "sensor": [_sensor_table(s) for s in setup.sensors],
     }
     said = f"# Learnt by saltus setup from {', '.join(files)}; give it to saltus track with --config.\n"
@@ -149,7 +151,7 @@ def saved_setup(config: Config, *, use_identity: bool) -> Setup | None:
         raise ModelError(f"{where}: [learnt] {key} = {brief(finding['input'])}: {finding['msg']}. {_CURE}") from error
     except (ValueError, ModelError) as error:
         raise ModelError(f"{where}: [learnt] {error}. {_CURE}") from error
-    return Setup(config, use_identity, learnt.time, plane, sensors)
+    return Setup(config, use_identity, learnt.time, plane, sensors, tuple(learnt.order))
 
 
 _CURE = "Write the file anew with saltus setup."

@@ -17,7 +17,7 @@ from saltus.engine.journal import Journal, foreign_columns
 from saltus.engine.learn import first_setup, usable, with_new_sources
 from saltus.engine.local import LocalTracking
 from saltus.engine.news import News
-from saltus.engine.result import Result, finished
+from saltus.engine.result import Result, finished, order_of_systems
 from saltus.engine.saved import saved_setup
 from saltus.engine.setup import Setup, site_of
 from saltus.engine.stored import config_from, setup_from, setup_state, source_from, source_words
@@ -267,6 +267,8 @@ class Session:
         self._adopt(first_setup(plots, self._config, self._periods, self._bar, use_identity=self._use_identity))
         self._stretch = Stretch(self._config.setup)
         self._track(plots, number)
+        order = order_of_systems(self._journal, self._setups[-1], self._files)
+        self._setups = [replace(setup, order=order) for setup in self._setups]
 
     def _of_sources(self, plots: Plots, count: int) -> Plots:
         """Reports of the first `count` sources: what comes later has no say in what is done before."""

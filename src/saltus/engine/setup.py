@@ -56,6 +56,7 @@ class Setup:
     time: float  # from when on it holds, s
     plane: Plane
     sensors: tuple[SensorSetup, ...]
+    order: tuple[str, ...] = ()  # systems, the reference first, the most trusted next; later ones come behind them
 
     def parties(self) -> list[Party]:
         """Return the systems: sources whose reports make common local tracks."""

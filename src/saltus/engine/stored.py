@@ -36,6 +36,7 @@ def setup_state(setup: Setup) -> tuple[dict[str, Any], dict[str, Any]]:
         "time": setup.time,
         "plane": [setup.plane.latitude, setup.plane.longitude],
         "sensors": [sensor_words(s) for s in setup.sensors],
+        "order": list(setup.order),
     }
     arrays = {str(k): _background_arrays(s.background) for k, s in enumerate(setup.sensors)}
     return arrays, words
@@ -49,6 +50,7 @@ def setup_from(arrays: Mapping[str, Any], words: Mapping[str, Any]) -> Setup:
         time=float(words["time"]),
         plane=Plane(*words["plane"]),
         sensors=tuple(_sensor(w, arrays[str(k)]) for k, w in enumerate(words["sensors"])),
+        order=tuple(words["order"]),
     )
 
 

@@ -1,8 +1,25 @@
 """Whether two systems report the same object: likelihood ratios, error probabilities and decisions, on arrays."""
 
-from saltus.identify.decide import Decisions, DecisionSettings, Episodes, decide_pairs
-from saltus.identify.evidence import APART, Evidence, as_evidence, join_evidence, pair_evidence
+from saltus.identify.decide import (
+    Decided,
+    Decider,
+    Decisions,
+    DecisionSettings,
+    Episodes,
+    decide_pairs,
+    joined_episodes,
+)
+from saltus.identify.evidence import (
+    APART,
+    Evidence,
+    as_evidence,
+    join_evidence,
+    latest_ratios,
+    pair_evidence,
+    window_start,
+)
 from saltus.identify.groups import Conflict
+from saltus.identify.local import thinned
 from saltus.identify.matched import PairDraws, Schedule, different_pairs, same_pairs, wide_spreads
 from saltus.identify.neyman import FalseRatios, false_ratios, filled
 from saltus.identify.pairs import LocalTracks, PairSettings, Ratios, candidate_pairs, pair_ratios
@@ -27,6 +44,8 @@ __all__ = [
     "SAME",
     "UNDECIDED",
     "Conflict",
+    "Decided",
+    "Decider",
     "DecisionSettings",
     "Decisions",
     "Episodes",
@@ -49,6 +68,8 @@ __all__ = [
     "identification_llr",
     "identification_terms",
     "join_evidence",
+    "joined_episodes",
+    "latest_ratios",
     "neyman_pearson_bound",
     "p_correct",
     "p_false",
@@ -60,8 +81,10 @@ __all__ = [
     "separation",
     "sprt",
     "sprt_bounds",
+    "thinned",
     "threshold",
     "track_updates",
     "tracklets",
     "wide_spreads",
+    "window_start",
 ]

@@ -6,7 +6,7 @@ the best alternative. A pair becomes one object when its margin reaches log[(1 -
 until its margin, with `hysteresis` in its favour, falls below 0. Nothing later than a decision enters it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from saltus.identify.verdict import posterior
 from saltus.models.checks import FloatArray, probability
 from saltus.shapes import Float, Int
 
-__all__ = ["DecisionSettings", "Decisions", "Episodes", "decide_pairs"]
+__all__ = ["Decided", "Decider", "DecisionSettings", "Decisions", "Episodes", "decide_pairs", "joined_episodes"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,8 @@ class Episodes(NamedTuple):
     time_from: Float[np.ndarray, " e"]  # s, of the decision that declared them
     time_to: Float[np.ndarray, " e"]  # s, of the decision that parted them, or of their last row
     probability: Float[np.ndarray, " e"]  # with which they were declared
-    since: Float[np.ndarray, " e"]  # s, of the last evidence before `time_from` that they were two; -inf: never any
+    since: Float[np.ndarray, " e"]  # s, of the last evidence that they were two before that which declared them one;
+    # -inf: never any
     until: Float[np.ndarray, " e"]  # s, of the last evidence that they were one
 
 
@@ -80,7 +81,7 @@ class Decisions(NamedTuple):
 
 
 class _Problem(NamedTuple):
-    """What does not change between decisions, for each pair."""
+    """What holds at one decision, for each pair."""
 
     pairs: Index  # (P, 2)
     system: Index  # of each track, (K,)
@@ -92,41 +93,139 @@ class _Problem(NamedTuple):
     settings: DecisionSettings
 
 
-class _Links:
-    """The declared pairs, and the episodes behind them."""
+class Decided(NamedTuple):
+    """What one decision changed."""
 
-    def __init__(self, n: int) -> None:
-        self.on = np.zeros(n, bool)
-        self._two, self._one = np.full(n, -np.inf), np.full(n, -np.inf)  # s: when evidence said so last
-        self._from, self._since, self._prob = np.zeros(n), np.zeros(n), np.zeros(n)
-        self._done: list[tuple[Index, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]] = []
+    begun: Episodes  # declared; when they end is not known, NaN
+    ended: Episodes
+    parted: npt.NDArray[np.bool_]  # of those ended: by evidence, not by silence
 
-    def weigh(self, now: float, score: FloatArray, bound: FloatArray) -> None:
-        """Note which pairs the evidence says to be one or two."""
-        self._one[score >= bound] = now
-        self._two[np.isfinite(score) & (score <= -bound)] = now
 
-    def update(self, now: float, keep: Index, probs: FloatArray, ended: FloatArray) -> None:
-        """Declare the pairs `keep` with their probabilities and part the others, which ended at `ended` (P,)."""
-        on, prob = np.zeros(len(self.on), bool), np.zeros(len(self.on))
-        on[keep], prob[keep] = True, probs
-        self.part(np.flatnonzero(self.on & ~on), ended)
-        fresh = np.flatnonzero(on & ~self.on)
-        self._from[fresh], self._since[fresh], self._prob[fresh] = now, self._two[fresh], prob[fresh]
-        self.on = on
+class _Links(NamedTuple):
+    """Pairs of which something is known, one array element each."""
 
-    def part(self, which: Index, ended: FloatArray) -> None:
-        """End episodes."""
-        since, until = self._from[which], np.maximum(ended[which], self._from[which])
-        last = np.clip(self._one[which], since, until)
-        self._done.append((which, since, until, self._prob[which], self._since[which], last))
+    pairs: Index  # (P, 2)
+    score: FloatArray  # latest log-odds
+    last: FloatArray  # s, of that
+    span: FloatArray  # s: since when the rows count that it is of; inf unknown
+    one: FloatArray  # s: when the evidence said last that they are one; -inf never
+    two: FloatArray  # or two
+    on: npt.NDArray[np.bool_]  # declared
+    start: FloatArray  # s, when declared
+    since: FloatArray  # s, when the evidence had said last then that they were two
+    prob: FloatArray  # with which they were declared
 
-    def episodes(self, pairs: Index) -> Episodes:
-        """All episodes, by time."""
-        which, since, *rest = (np.concatenate(column) for column in zip(*self._done, strict=True))
-        order = np.lexsort((which, since))
-        a, b = pairs[which[order]].T
-        return Episodes(a, b, since[order], *(column[order] for column in rest))
+    def take(self, at: Index | npt.NDArray[np.bool_]) -> "_Links":
+        return _Links._make(column[at] for column in self)
+
+    def with_pairs(self, pairs: Index, apart: FloatArray) -> "_Links":
+        """Return these with further pairs, (n, 2), that were two at times `apart`."""
+        n = len(pairs)
+        never, nothing = np.full(n, -np.inf), np.zeros(n)
+        new = _Links(pairs, never, never, -never, never, apart, np.zeros(n, bool), nothing, never, nothing)
+        return _Links._make(np.concatenate(columns) for columns in zip(self, new, strict=True))
+
+
+class Decider:
+    """Decides as evidence comes in; what is undecided and silent is forgotten, so memory does not grow."""
+
+    def __init__(self, settings: DecisionSettings) -> None:
+        """Begin without pairs."""
+        self._settings, self._log = settings, ConflictLog(2.5 * settings.every)
+        none = np.zeros(0)
+        self._links = _Links(np.zeros((0, 2), np.int64), *(none,) * 5, none.astype(bool), none, none, none)
+
+    @property
+    def pairs(self) -> Int[np.ndarray, "p 2"]:
+        """The pairs of which something is known."""
+        return self._links.pairs
+
+    def update(
+        self,
+        now: float,
+        pairs: Int[np.ndarray, "n 2"],
+        time: Float[np.ndarray, " n"],
+        llr: Float[np.ndarray, " n"],
+        *,
+        system: Int[np.ndarray, " k"],
+        address: Int[np.ndarray, " k"],
+        prior: float | None = None,
+        apart: Float[np.ndarray, " n"] | None = None,
+        span: Float[np.ndarray, " n"] | None = None,
+        alive: npt.NDArray[np.bool_] | None = None,
+    ) -> Decided:
+        """Decide.
+
+        Args:
+            now: s.
+            pairs: that something new is known of, each once, (n, 2).
+            time: of that, (n,), s.
+            llr: log-likelihood ratio, (n,), nats.
+            system: of each track so far, (K,).
+            address: of each track, as known now, (K,), -1 unknown.
+            prior: probability of one object before any measurement, if it is not that of the settings.
+            apart: when each pair was two objects, if it is a new one, (n,), s; -inf: never known to be.
+            span: since when the rows count that each ratio is of, (n,), s.
+            alive: tracks of which nothing but silence on a pair says nothing: a declared pair of two holds, (K,).
+        """
+        s, prior = self._settings, self._settings.prior if prior is None else prior
+        apart = np.full(len(pairs), -np.inf) if apart is None else apart
+        links, which = self._found(np.asarray(pairs, np.int64).reshape(-1, 2), apart)
+        links.span[which] = np.inf if span is None else span
+        links.score[which], links.last[which] = llr + float(np.log(prior) - np.log1p(-prior)), time
+        problem = _problem(links.pairs, system, address, s)
+        fresh = now - links.last <= np.where(links.on, s.hold, 0.5 * s.hold)
+        if alive is not None:
+            fresh |= links.on & alive[links.pairs].all(axis=1)
+        score = np.where(fresh, links.score, -np.inf)
+        told = now - links.last <= 0.5 * s.hold
+        links.one[told & (score >= problem.bound)] = now
+        links.two[told & (score <= -problem.bound)] = now
+        keep, probs = _decide(problem, now, score, links.on, self._log)
+        on = np.zeros(len(score), bool)
+        on[keep] = True
+        over, new = np.flatnonzero(links.on & ~on), np.flatnonzero(on & ~links.on)
+        ended = _episodes(links.take(over), np.where(fresh, now, links.last)[over])
+        links.prob[keep] = np.where(links.on[keep], links.prob[keep], probs)
+        links.start[new], links.since[new] = now, np.minimum(links.two, links.span)[new]
+        self._links = links._replace(on=on).take(on | (now - links.last <= 2.0 * s.hold))
+        begun = links.take(new)
+        return Decided(_episodes(begun, np.full(len(new), np.nan)), ended, fresh[over])
+
+    def _found(self, pairs: Index, apart: FloatArray) -> tuple[_Links, Index]:
+        """Return the links, all pairs given among them, and the place of each."""
+        width = 1 + int(max(pairs.max(initial=0), self._links.pairs.max(initial=0)))
+        key, known = pairs[:, 0] * width + pairs[:, 1], self._links.pairs[:, 0] * width + self._links.pairs[:, 1]
+        new = ~np.isin(key, known)
+        links = self._links.with_pairs(pairs[new], apart[new])
+        every = np.concatenate([known, key[new]])
+        order = np.argsort(every, kind="stable")
+        links = links.take(order)  # sorted: whatever the order in which they came
+        return links, np.searchsorted(every[order], key)
+
+    def conflicts(self) -> tuple[Conflict, ...]:
+        """All conflicts so far, by time."""
+        return self._log.conflicts()
+
+    def open(self) -> Episodes:
+        """Return the pairs declared now; they last until what is known of them last."""
+        links = self._links.take(self._links.on)
+        return _episodes(links, links.last)
+
+
+def _episodes(links: _Links, ended: FloatArray) -> Episodes:
+    until = np.maximum(ended, links.start)
+    a, b = links.pairs.T
+    return Episodes(a, b, links.start, until, links.prob, links.since, np.clip(links.one, links.start, until))
+
+
+def joined_episodes(parts: Sequence[Episodes]) -> Episodes:
+    """Join episodes, by time."""
+    none, nobody = np.zeros(0), np.zeros(0, np.int64)
+    parts = [Episodes(nobody, nobody, *(none,) * 5), *parts]
+    e = Episodes._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
+    order = np.lexsort((e.b, e.a, e.time_from))
+    return Episodes._make(column[order] for column in e)
 
 
 def decide_pairs(
@@ -153,38 +252,28 @@ def decide_pairs(
     Raises:
         DataError: evidence that names no tracks, or systems and addresses that are not those of the tracks.
     """
-    problem = _problem(evidence, system, address, settings)
-    n = len(problem.pairs)
-    links, log = _Links(n), ConflictLog(2.5 * settings.every)
-    score, last = np.full(n, -np.inf), np.full(n, -np.inf)
-    odds = float(np.log(settings.prior) - np.log1p(-settings.prior))
-    for now, rows in _decisions(evidence, settings):
-        which = evidence.pair[rows]
-        score[which], last[which] = evidence.llr[rows] + odds, evidence.time[rows]
-        fresh = now - last <= np.where(links.on, settings.hold, 0.5 * settings.hold)
-        known = np.where(fresh, score, -np.inf)
-        links.weigh(now, known, problem.bound)
-        keep, probs = _decide(problem, now, known, links.on, log)
-        links.update(now, keep, probs, np.where(fresh, now, last))
-    links.part(np.flatnonzero(links.on), last)
-    return Decisions(links.episodes(problem.pairs), log.conflicts())
-
-
-def _problem(
-    evidence: Evidence, system: npt.ArrayLike, address: npt.ArrayLike | None, settings: DecisionSettings
-) -> _Problem:
     pairs, of = np.asarray(evidence.pairs).reshape(-1, 2), np.asarray(system, dtype=np.int64)
     names = np.full(of.shape, -1) if address is None else np.asarray(address, dtype=np.int64)
     if of.ndim != 1 or names.shape != of.shape:
         raise DataError(f"system {of.shape} and address {names.shape} must be one number for each track, (K,).")
     if len(pairs) and not (0 <= pairs.min() and pairs.max() < len(of)):
         raise DataError(f"evidence names tracks {pairs.min()}..{pairs.max()}, but there are {len(of)} tracks.")
-    a, b = names[pairs[:, 0]], names[pairs[:, 1]]
+    decider, found = Decider(settings), []
+    for now, rows in _decisions(evidence, settings):
+        which = pairs[evidence.pair[rows]]
+        found.append(
+            decider.update(now, which, evidence.time[rows], evidence.llr[rows], system=of, address=names).ended
+        )
+    return Decisions(joined_episodes([*found, decider.open()]), decider.conflicts())
+
+
+def _problem(pairs: Index, system: Index, address: Index, settings: DecisionSettings) -> _Problem:
+    a, b = address[pairs[:, 0]], address[pairs[:, 1]]
     known = (a >= 0) & (b >= 0)
-    split = of[pairs[:, 0]] == of[pairs[:, 1]]
+    split = system[pairs[:, 0]] == system[pairs[:, 1]]
     p = np.where(split, settings.p_false_split, settings.p_false)
     bound = np.log1p(-p) - np.log(p)
-    return _Problem(pairs, of, names, split, known & (a != b), known & (a == b), bound, settings)
+    return _Problem(pairs, system, address, split, known & (a != b), known & (a == b), bound, settings)
 
 
 def _decisions(evidence: Evidence, settings: DecisionSettings) -> Iterator[tuple[float, Index]]:

@@ -18,7 +18,15 @@ from saltus.identify.pairs import Ratios, candidate_pairs, pair_ratios
 from saltus.models.checks import FloatArray
 from saltus.shapes import Float, Int
 
-__all__ = ["APART", "Evidence", "as_evidence", "join_evidence", "pair_evidence"]
+__all__ = [
+    "APART",
+    "Evidence",
+    "as_evidence",
+    "join_evidence",
+    "latest_ratios",
+    "pair_evidence",
+    "window_start",
+]
 
 APART = -100.0  # nats: what a pair is worth while both tracks live out of each other's reach
 
@@ -30,6 +38,42 @@ class Evidence(NamedTuple):
     pair: Int[np.ndarray, " n"]  # row of `pairs`
     time: Float[np.ndarray, " n"]  # s, not decreasing within a pair
     llr: Float[np.ndarray, " n"]  # nats, of the rows that count at that time
+
+
+def window_start(now: float, window: float) -> float:
+    """Return since when rows count at a time: the last multiple of W/2 that lies at least W/2 before it, s."""
+    return float((np.floor(now / (0.5 * window)) - 1.0) * 0.5 * window)
+
+
+def latest_ratios(
+    a: LocalTracks, b: LocalTracks, settings: Sequence[PairSettings], weights: Sequence[float], *, reach: float
+) -> tuple[Int[np.ndarray, "p 2"], Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Return what the rows given say of every pair within reach: a mixture of ratios, as of the pair's last row.
+
+    Args:
+        a: rows of one system's tracks in a window.
+        b: of the other's; a itself for splits.
+        settings: objects and offsets, of each component.
+        weights: probability of each component.
+        reach: m, see `candidate_pairs`.
+
+    Returns:
+        Pairs (P, 2), times of their last rows (P,), s, and ratios (P,), nats.
+    """
+    pairs = candidate_pairs(a, b, settings[0], reach=reach)
+    if a is b:
+        pairs = pairs[pairs[:, 0] < pairs[:, 1]]
+    total, time = np.full(len(pairs), -np.inf), np.full(len(pairs), -np.inf)
+    last = np.zeros(len(pairs), np.int64)
+    for component, weight in zip(settings, weights, strict=True):
+        ratios = pair_ratios(a, b, pairs, component)
+        last = ratios.count - 1
+        if not (len(pairs) and last.max() >= 0):
+            return pairs[:0], time[:0], total[:0]
+        total = np.logaddexp(total, ratios.llr[np.arange(len(pairs)), last] + np.log(weight))
+        time = ratios.time[np.arange(len(pairs)), last]
+    some = last >= 0
+    return pairs[some], time[some], total[some]
 
 
 class _Pieces(NamedTuple):

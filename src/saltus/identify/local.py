@@ -12,7 +12,7 @@ from saltus.models import Chain
 from saltus.models.checks import FloatArray, covariance, numbers, same
 from saltus.shapes import Bool, Float, Int
 
-__all__ = ["LocalTracks", "PairSettings", "Spans", "spans"]
+__all__ = ["LocalTracks", "PairSettings", "Spans", "spans", "thinned"]
 
 
 class LocalTracks(NamedTuple):
@@ -130,6 +130,13 @@ class PairSettings:
         mean, cov = np.zeros(4), self.speed_sigma**2 * np.eye(4)
         mean[0::2], cov[0::2, 0::2] = self.region_mean, self.region_cov
         return mean, cov
+
+
+def thinned(tracks: LocalTracks, spacing: float) -> LocalTracks:
+    """Keep the last row of each track in each stretch of `spacing` seconds."""
+    last = np.ones(len(tracks.time), bool)
+    last[:-1] = (np.diff(np.floor(tracks.time / spacing)) != 0) | (np.diff(tracks.track) != 0)
+    return LocalTracks(*(column[last] for column in tracks))
 
 
 class Spans(NamedTuple):

@@ -33,6 +33,7 @@ UNITS: dict[str, dict[str, str]] = {
     "systems": {
         "split_offset": "m",
         "hysteresis": "nats",
+        "every": "s",
         "window": "s",
         "offset_time": "s",
         "spacing": "s",

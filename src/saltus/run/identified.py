@@ -9,8 +9,8 @@ import numpy.typing as npt
 from saltus.engine.identified import Identified, bias_tables, biases, published_tracks
 from saltus.report.systems import CONFLICTS, SystemsFound
 from saltus.tracks.encounters import SystemTracks
-from saltus.tracks.identities import decision_rule
 from saltus.tracks.membership import Segments
+from saltus.tracks.picture import decision_settings
 from saltus.tracks.settings import SystemsSettings
 
 __all__ = [
@@ -141,6 +141,6 @@ def systems_found(whole: Identified, settings: SystemsSettings, titles: Mapping[
         segments=Segments(*(column[published] for column in whole.segments)),
         decisions=whole.decisions,
         evidence=whole.evidence,
-        rule=decision_rule(whole.systems, settings),
+        rule=decision_settings(settings),
         biases=bias_tables(whole),
     )

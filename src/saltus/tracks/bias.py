@@ -9,7 +9,7 @@ import numpy.typing as npt
 from saltus.shapes import Bool, Float
 from saltus.tracks.measurements import Measurements
 
-__all__ = ["GROUPS", "PARAMETERS", "BiasSeries", "corrected", "effects", "learnt", "second_order", "spread"]
+__all__ = ["GROUPS", "PARAMETERS", "BiasSeries", "corrected", "effects", "learnt", "second_order", "spread", "steps"]
 
 _Array = npt.NDArray[np.float64]
 
@@ -37,6 +37,7 @@ class BiasSeries:
     estimated: Bool[np.ndarray, "e q"]
     scatter: Float[np.ndarray, " e"]  # m: standard deviation between objects, each axis
     objects: npt.NDArray[np.int64]  # (E,): pairs of tracks that it rests on
+    excess: Float[np.ndarray, " e"]  # m: of what differs within an object beyond the stated noise, each axis
     prior: Float[np.ndarray, " q"]  # standard deviations before anything is known
 
     def at(self, time: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, "n q"], Float[np.ndarray, "n q q"]]:
@@ -45,6 +46,11 @@ class BiasSeries:
         mean = np.concatenate([np.zeros((1, len(PARAMETERS))), self.mean])
         cov = np.concatenate([np.diag(self.prior**2)[None], self.cov])
         return mean[index], cov[index]
+
+
+def steps(time: Float[np.ndarray, " e"], values: Float[np.ndarray, " e"], at: Float[np.ndarray, " n"]) -> _Array:
+    """Return the values known at given times, 0 before the first."""
+    return np.append(0.0, values)[np.searchsorted(time, at, side="right")]
 
 
 def effects(ray: Float[np.ndarray, "n 2"], velocity: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2 q"]:

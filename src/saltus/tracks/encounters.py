@@ -75,7 +75,8 @@ def encounters(a: SystemTracks, b: SystemTracks, pairs: Int[np.ndarray, "p 2"], 
     cov = a.tracks.R[row] + (1.0 - w) ** 2 * b.tracks.R[before] + w**2 * b.tracks.R[after] + bent**2 * np.eye(2)
     seen = np.maximum(time, b.tracks.time[after])
     effect = effects(a.ray[row], a.velocity[row])
-    return _blocks(pair, np.floor((time - start) / length), seen, a.tracks.z[row] - at_b, effect, cov)
+    block = np.floor(time / length) - np.floor(start / length)  # the same blocks, whatever the first report given
+    return _blocks(pair, block, seen, a.tracks.z[row] - at_b, effect, cov)
 
 
 def _rows_in(track: _Index, wanted: _Index) -> tuple[_Index, _Index]:

@@ -36,6 +36,8 @@ class LocalSystem(NamedTuple):
     ids: Int[np.ndarray, " k"]  # the local tracker's number of each track
     measurement: Int[np.ndarray, " n"]  # of each row; -1 where the system gives tracks only
     noise: float  # median stated standard deviation of a report, each axis, m
+    known: npt.NDArray[np.float64]  # (n,): when each row was known, s
+    codes: Int[np.ndarray, "n 2"]  # address and Mode 3/A code of each row, -1 none
 
     @property
     def own(self) -> bool:
@@ -87,7 +89,12 @@ def local_system(
     ids, track = np.unique(found.track_id[at], return_inverse=True)
     sure = rows.status == 2
     ready = np.full(len(ids), np.inf)
-    np.minimum.at(ready, np.searchsorted(ids, rows.track_id[sure]), rows.time[sure])
+    place = np.minimum(np.searchsorted(ids, rows.track_id), max(len(ids) - 1, 0))
+    sure &= ids[place] == rows.track_id if len(ids) else False
+    np.minimum.at(ready, place[sure], rows.time_known[sure])
+    known = np.full(len(m), np.nan)
+    known[rows.measurement[update]] = rows.time_known[update]
+    known = np.where(np.isnan(known[at]), ready[track], known[at])  # a track's first plots, told with a later one
     R = (m.cov[at] + m.stamped(at, velocity[at]))[:, :2, :2] * m.inflation[at, None, None]
     noise = float(np.sqrt(np.median(np.trace(R, axis1=-2, axis2=-1)) / 2.0)) if len(at) else np.inf
     R = R * _misfit(track, m.time[at], m.position[at, :2], R)[:, None, None]
@@ -102,7 +109,9 @@ def local_system(
         m.ray[at],
         icao24 if use_identity else hidden,
     )
-    return LocalSystem(name, view, mode3a if use_identity else hidden, label, ready, ids, at, noise)
+    codes = np.column_stack([m.icao24[at], m.mode3a[at]]).astype(np.int64)
+    codes = codes if use_identity else np.full_like(codes, -1)
+    return LocalSystem(name, view, mode3a if use_identity else hidden, label, ready, ids, at, noise, known, codes)
 
 
 def _misfit(track: _Index, time: _Array, z: _Array, R: _Array) -> _Array:
@@ -184,7 +193,9 @@ def _foreign(name: str, tracks: pa.Table, plane: Plane, sigma: float, *, use_ide
     label = tuple(str(int(n)) for n in number[order][first])
     none = np.full(len(track), -1)
     codes = mode3a if use_identity else hidden
-    return LocalSystem(name, view, codes, label, time[order][first], np.arange(len(first)), none, sigma)
+    told = np.column_stack([address, code]) if use_identity else np.full((len(track), 2), -1)
+    when, ids = time[order], np.arange(len(first))
+    return LocalSystem(name, view, codes, label, when[first], ids, none, sigma, when, told)
 
 
 def _numbers(tracks: pa.Table, name: str) -> _Array:

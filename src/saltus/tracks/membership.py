@@ -15,14 +15,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.identify import Episodes
 from saltus.shapes import Float, Int
 
-__all__ = ["Change", "Local", "Membership", "Merger", "Segments", "known_since", "segments"]
+__all__ = ["Change", "Local", "Membership", "Merger", "Segments", "known_since"]
 
 _Array = npt.NDArray[np.float64]
-
-_DEATH, _PART, _BIRTH, _JOIN = 0, 1, 2, 3  # the order of what becomes known at one time
 
 
 class Segments(NamedTuple):
@@ -150,6 +147,14 @@ class Membership:
         system = self._local[b].system
         rivals = [k for k in others if self._local[k].system == system != self._local[a].system]
         return max((self._ended[k] for k in rivals if k in self._ended), default=-np.inf)
+
+    def named(self, k: int, address: int) -> None:
+        """A local track's address has become known, or is another one."""
+        self._local[k] = self._local[k]._replace(address=address)
+
+    def revived(self, k: int) -> None:
+        """A local track thought to have ended has not."""
+        self._ended.pop(k, None)
 
     def death(self, k: int, last: float) -> None:
         """A local track has ended, with a report at `last`, s."""
@@ -302,51 +307,3 @@ def known_since(changes: Sequence[Change], number: Int[np.ndarray, " n"], time: 
         latest = np.append(-np.inf, np.maximum.accumulate(known[mine]))
         out[rows] = latest[np.searchsorted(since[mine], time[rows], side="right")]
     return out
-
-
-class _Event(NamedTuple):
-    known: float
-    kind: int
-    a: int
-    b: int
-    time: float  # from when on it holds, s
-    probability: float
-
-
-def segments(locals_: Sequence[Local], ready: _Array, end: _Array, episodes: Episodes) -> tuple[Segments, Membership]:
-    """Cut the lives of local tracks at what decisions say about them.
-
-    Args:
-        locals_: local tracks, (K,).
-        ready: when each was confirmed, (K,), s; inf: never.
-        end: its last report, (K,), s.
-        episodes: which tracks were one object, and when.
-    """
-    membership = Membership()
-    for event in sorted(_events(ready, end, episodes)):
-        if event.kind == _BIRTH:
-            membership.birth(event.a, locals_[event.a], event.known)
-        elif event.kind == _DEATH:
-            membership.death(event.a, event.time)
-        elif event.kind == _JOIN:
-            membership.join(event.a, event.b, event.time, event.known, event.probability)
-        else:
-            membership.part(event.a, event.b, event.time, event.known)
-    return membership.segments(end), membership
-
-
-def _events(ready: _Array, end: _Array, episodes: Episodes) -> Iterable[_Event]:
-    for k, time in enumerate(ready.tolist()):
-        if np.isfinite(time):
-            yield _Event(time, _BIRTH, k, k, time, 1.0)
-            yield _Event(float(end[k]), _DEATH, k, k, float(end[k]), 1.0)
-    for row in zip(*(column.tolist() for column in episodes), strict=True):
-        e = Episodes(*row)
-        a, b = int(e.a), int(e.b)
-        born = max(float(ready[a]), float(ready[b]))
-        if not np.isfinite(born) or e.time_to < born:
-            continue
-        known = max(born, float(e.time_from))
-        yield _Event(known, _JOIN, a, b, float(e.since), float(e.probability))
-        if e.time_to < min(end[a], end[b]):  # both live on: a change of mind
-            yield _Event(max(float(e.time_to), known), _PART, a, b, float(e.until), 1.0)

@@ -178,6 +178,7 @@ class SystemsSettings:
         p_false_split: the same for two tracks of one radar, second echoes of an object in motion.
         split_offset: standard deviation of the distance between two echoes of one object, each axis, m.
         hysteresis: log-odds by which a declared pair may fall short of the best alternative, nats.
+        every: s between two looks at what the systems say, at which tracks are declared one.
         window: s; what tracks did longer ago says nothing about whether they are one object now.
         offset_time: s that the difference between two systems' positions of one object lasts.
         spacing: s that short errors last: of reports of one track that follow faster, one in so many s counts.
@@ -191,6 +192,7 @@ class SystemsSettings:
     p_false_split: float = 1e-3
     split_offset: float = 20.0
     hysteresis: float = 5.0
+    every: float = 10.0
     window: float = 120.0
     offset_time: float = 60.0
     spacing: float = 10.0
@@ -206,6 +208,7 @@ class SystemsSettings:
         for name in (
             "split_offset",
             "hysteresis",
+            "every",
             "window",
             "offset_time",
             "spacing",

@@ -10,17 +10,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.identify import Evidence, LocalTracks, pair_evidence
-from saltus.tracks.local import LocalSystem
+from saltus.identify import LocalTracks, thinned
+from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.membership import Segments
-from saltus.tracks.settings import FilterSettings, SystemsSettings
-from saltus.tracks.systems import pairing_settings
 
-__all__ = ["Spell", "second_echoes", "split_evidence"]
+__all__ = ["Spell", "echo_rows", "second_echoes"]
 
 _MOVING = 2.0  # m/s
 _APART = 4.0  # s between reports that count
-_REACH = 5.0  # standard deviations of the distance between echoes
 
 
 class Spell(NamedTuple):
@@ -31,27 +28,17 @@ class Spell(NamedTuple):
     time_to: float  # s
 
 
-def split_evidence(system: LocalSystem, settings: SystemsSettings, filters: FilterSettings) -> Evidence | None:
-    """Return the evidence that tracks of one radar are one object, from the reports made in motion; None without any.
+def echo_rows(view: SystemTracks, *, own: bool) -> LocalTracks:
+    """Return the rows of a radar by which its tracks may be found to be one object: those made in motion.
+
+    Other systems tell targets apart by their transponders: none of theirs.
 
     Args:
-        system: a radar with several local tracks; other systems tell targets apart by their transponders.
-        settings: the distance between echoes to expect.
-        filters: how objects move.
+        view: rows of a system.
+        own: whether they are measurements.
     """
-    view = system.view
-    moving = np.isfinite(view.ray[:, 0]) & (np.hypot(view.velocity[:, 0], view.velocity[:, 1]) > _MOVING)
-    if not system.own or not moving.any():
-        return None
-    rows = LocalTracks(*(column[moving] for column in view.tracks))
-    last = np.ones(len(rows.time), bool)
-    last[:-1] = (np.diff(np.floor(rows.time / _APART)) != 0) | (np.diff(rows.track) != 0)
-    ids, number = np.unique(rows.track[last], return_inverse=True)
-    rows = LocalTracks(number, rows.time[last], rows.z[last], rows.R[last])
-    pairing = pairing_settings([system], settings, filters, settings.split_offset)
-    reach = _REACH * settings.split_offset
-    found = pair_evidence(rows, rows, pairing, reach=reach, window=0.5 * settings.window)
-    return found._replace(pairs=ids[found.pairs])
+    moving = np.isfinite(view.ray[:, 0]) & (np.hypot(view.velocity[:, 0], view.velocity[:, 1]) > _MOVING) & own
+    return thinned(LocalTracks(*(column[moving] for column in view.tracks)), _APART)
 
 
 def second_echoes(segments: Segments, system: npt.NDArray[np.int64]) -> list[Spell]:

@@ -20,7 +20,7 @@ from saltus.tracks.rows import Assignments, ConditionFound, Rows, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.slices import slices
 from saltus.tracks.splits import second_echoes
-from saltus.tracks.systems import Registered
+from saltus.tracks.systems import Registered, lasting_differences
 
 __all__ = ["Part", "SystemTracking", "track_systems"]
 
@@ -69,7 +69,6 @@ class _Scene(NamedTuple):
 def track_systems(
     parts: Sequence[Part],
     segments: Segments,
-    lasting: float,
     filters: FilterSettings,
     settings: TrackerSettings,
     periods: Sequence[float],
@@ -85,7 +84,6 @@ def track_systems(
     Args:
         parts: systems in the order in which local tracks are numbered.
         segments: to which system track each local track belongs, and when.
-        lasting: standard deviation of what lasts between systems, m: added where systems meet in a track.
         filters: manoeuvres.
         settings: faults, coasting.
         periods: s without a report after which a target counts as missed, of each source.
@@ -106,7 +104,7 @@ def track_systems(
     lanes = Lanes(*(column[~_echoing(lanes, scene.time, segments, parts)] for column in lanes))
     laws = [_law(parts, s) for s in range(len(periods))]
     fusion = Fusion(settings, filters, laws, periods, use_identity=use_identity)
-    published = [part for c in _candidates(lanes, scene, lasting, periods) for part in fusion.feed(m, c)]
+    published = [part for c in _candidates(lanes, scene, periods) for part in fusion.feed(m, c)]
     return SystemTracking(join_rows(published), m, _assigned(parts, place, of, fusion.conditions))
 
 
@@ -176,7 +174,7 @@ def _lanes(m: Measurements, of: _Index, local: _Index, rows: Rows) -> Lanes:
     return Lanes(index, of[index], local[index], row[index])
 
 
-def _candidates(lanes: Lanes, scene: _Scene, lasting: float, periods: Sequence[float]) -> Iterator[Candidates]:
+def _candidates(lanes: Lanes, scene: _Scene, periods: Sequence[float]) -> Iterator[Candidates]:
     """Reports of local tracks for system tracks, a slice of time each."""
     m, owner = scene.m, scene.owner[lanes.number]
     several = since(
@@ -186,11 +184,13 @@ def _candidates(lanes: Lanes, scene: _Scene, lasting: float, periods: Sequence[f
     sure, (shift, turn) = since(known, lanes.track), _reframed(lanes, scene)
     order = np.argsort(m.time[lanes.number], kind="stable")
     time = m.time[lanes.number[order]]
-    used = np.unique(m.source[lanes.number])
-    for begin, end in slices(time, min([_LONGEST, *(periods[s] for s in used.tolist())]), np.inf):
+    lasting = lasting_differences([part.registered for part in scene.parts], m.time)
+    for begin, end in slices(time, min([_LONGEST, *periods]), np.inf):
         at = order[begin:end]
         number, extra = lanes.number[at], np.zeros((end - begin, 2, 2))
-        extra[several[at]] = 0.5 * lasting**2 * np.eye(2) + scene.doubt[number[several[at]]]
+        extra[several[at]] = (
+            0.5 * lasting[number[several[at]], None, None] ** 2 * np.eye(2) + scene.doubt[number[several[at]]]
+        )
         begins = (lanes.row[at] >= 0) & np.isfinite(m.position[number, 0])
         mean, cov = _state(scene, number, np.maximum(lanes.row[at], 0))
         yield Candidates(number, lanes.track[at], sure[at], begins, mean, cov, shift[at], turn[at], extra)
