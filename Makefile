@@ -11,8 +11,9 @@ DOCS_READY := $(VENV)/.docs-ready
 demo: $(READY)
 	$(BIN)/saltus demo -o out/demo
 
+# Compiled modules are kept: the tests start hundreds of processes, and each would compile the package anew.
 test: $(READY)
-	$(BIN)/python -m pytest -n auto
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n auto
 
 # Kill runs of the tracker at every call of the file system and at random moments.
 KILLS ?= 200
@@ -72,18 +73,24 @@ sanitize: $(READY)
 	  PYTHONPATH="$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" \
 	  build/sanitize/bin/python -m pytest -n auto $(SANITIZED)
 
-# Every reader under mutated inputs, guided by the branches they reach, for so many seconds each; the fuzzer lives in an
-# environment of its own that borrows the packages of .venv. What fails goes to tests/fuzz/corpus.
+# Every reader under mutated inputs, guided by the branches they reach, for so many seconds each; with GUIDED=no by chance
+# and for so many seconds in all, seeded. The guided fuzzer lives in an environment of its own that borrows the packages
+# of .venv; where it has no wheel it is said and chance takes its place. What fails goes to tests/fuzz/corpus.
 FUZZ_SECONDS ?= 900
+GUIDED ?= yes
 fuzz: $(READY)
-	mkdir -p build/fuzz
-	$(PYTHON) -m venv build/fuzz/venv
-	build/fuzz/venv/bin/python -m pip install -q atheris==3.1.0
-	$(BIN)/python -c 'import sysconfig; print("import site; site.addsitedir(%r)" % sysconfig.get_path("purelib"))' \
-	  > "$$(build/fuzz/venv/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth"
-	for target in $$($(BIN)/python tests/fuzz/long.py --list); do \
-	  build/fuzz/venv/bin/python tests/fuzz/long.py --guided --seconds $(FUZZ_SECONDS) --target $$target || exit 1; \
-	done
+	@if [ "$(GUIDED)" = yes ]; then \
+	  mkdir -p build/fuzz && $(PYTHON) -m venv build/fuzz/venv || exit 1; \
+	  if build/fuzz/venv/bin/python -m pip install -q --only-binary :all: atheris==3.0.0; then \
+	    $(BIN)/python -c 'import sysconfig; print("import site; site.addsitedir(%r)" % sysconfig.get_path("purelib"))' \
+	      > "$$(build/fuzz/venv/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth"; \
+	    for target in $$($(BIN)/python tests/fuzz/long.py --list); do \
+	      build/fuzz/venv/bin/python tests/fuzz/long.py --guided --seconds $(FUZZ_SECONDS) --target $$target || exit 1; \
+	    done; exit; \
+	  fi; \
+	  echo "make fuzz: atheris 3.0.0 cannot be installed for this Python: inputs are mutated by chance." >&2; \
+	fi; \
+	$(BIN)/python tests/fuzz/long.py --seconds $(FUZZ_SECONDS)
 
 # Where there is a C++20 compiler the kernel must compile; where there is none, that is said and the package works.
 $(READY): pyproject.toml $(NATIVE)

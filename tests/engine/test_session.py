@@ -168,9 +168,12 @@ def test_a_damaged_journal_is_noticed_before_the_run_goes_on(config, tmp_path, m
     session.save(tmp_path)
     segment = tmp_path / "plots-000000.arrow"
     whole = segment.read_bytes()
-    for broken in (b"", whole[:500], None):
+    changed = bytearray(whole)
+    changed[len(whole) // 2] ^= 1
+    for broken in (b"", whole[:500], bytes(changed), None):
         segment.write_bytes(broken) if broken is not None else segment.unlink()
-        with pytest.raises(DataError, match=r"plots-000000.arrow: the journal's segment cannot be read"):
+        said = "was changed after it was sealed" if broken is not None else "cannot be read"
+        with pytest.raises(DataError, match=rf"plots-000000\.arrow: the journal's segment {said}"):
             Session.restore(tmp_path)
     segment.write_bytes(whole)
     equal(session.finish(), Session.restore(tmp_path).finish())
@@ -199,9 +202,10 @@ def test_what_is_no_checkpoint_is_said(config, tmp_path):
     pointer.write_text(json.dumps({**found, "format": 99}))
     with pytest.raises(DataError, match=r"format 99 .* Go on with the version that wrote it"):
         Session.restore(tmp_path)
-    pointer.write_text(json.dumps(found)[:-20])
-    with pytest.raises(DataError, match="no readable checkpoint"):
-        Session.restore(tmp_path)
+    for broken in (json.dumps(found)[:-20], "[" * 100_000):
+        pointer.write_text(broken)
+        with pytest.raises(DataError, match="no readable checkpoint"):
+            Session.restore(tmp_path)
     for state in ("../victim.npz", str(tmp_path / "victim"), "state-1.npz", None):
         pointer.write_text(json.dumps({**found, "state": state}))
         with pytest.raises(DataError, match="no checkpoint"):
@@ -218,6 +222,9 @@ def test_what_is_no_checkpoint_is_said(config, tmp_path):
         with pytest.raises(DataError, match=r"the checkpoint there .* Begin anew"):
             Session.restore(tmp_path)
     state.write_bytes(whole)
+    pointer.write_text(json.dumps({**found, "words": found["words"] | {"hold": 2.5}}))
+    with pytest.raises(DataError, match=r"checkpoint\.json was changed after it was written"):
+        Session.restore(tmp_path)
     for name in ("words", *found["words"]):
         less = json.loads(json.dumps(found))
         (less if name == "words" else less["words"]).pop(name)

@@ -1,4 +1,4 @@
-"""`make fuzz`: mutate inputs for as long as wanted; coverage-guided by atheris where it is installed, else by chance.
+"""`make fuzz`: mutate inputs for as long as wanted: by chance, or guided by coverage, which needs atheris.
 
     python tests/fuzz/long.py --seconds 3600 --seed 1 [--bytes 1e7] [--target csv ...] [--guided]
 
@@ -7,16 +7,19 @@ Prints a line for each target and writes every input that failed to tests/fuzz/c
 """
 
 import argparse
+import gc
 import hashlib
 import random
 import sys
 import tempfile
 import time
 from pathlib import Path
+from types import FunctionType
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from fuzzing import CORPUS, Failed, Target, check, mutated, targets
+from fuzzing import CORPUS, Failed, Target, check, mutated
+from targets import targets
 
 
 def keep(target: Target, content: bytes, failure: Failed, seen: set[str]) -> None:
@@ -56,12 +59,15 @@ def guided(target: Target, seconds: float, seed: int) -> None:
     """Let atheris mutate one target, guided by the branches of saltus that its inputs reach; a failure ends it."""
     import atheris
 
-    atheris.instrument_all()
     folder = Path(tempfile.mkdtemp())
     grown = Path("build/fuzz") / target.name
     grown.mkdir(parents=True, exist_ok=True)
     for k, content in enumerate(target.seeds):
+        check(target, content, folder)  # imports what it needs
         (grown / f"seed-{k}").write_bytes(content)
+    for function in gc.get_objects():
+        if isinstance(function, FunctionType) and (function.__module__ or "").startswith("saltus."):
+            atheris.instrument_func(function)
 
     def one(content: bytes) -> None:
         try:

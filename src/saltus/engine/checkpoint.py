@@ -1,9 +1,14 @@
-"""A checkpoint: a session's state as one file of arrays and one of words, replaced as a whole."""
+"""A checkpoint: a session's state as one file of arrays and one of words, replaced as a whole.
+
+What was changed after it was written is refused: arrays and words have a checksum, and so has each of the journal's
+segments. A changed number would otherwise be a wrong state, and go unnoticed.
+"""
 
 import json
 import os
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -18,7 +23,7 @@ from saltus.errors import DataError
 
 __all__ = ["begin_anew", "has_checkpoint", "load_checkpoint", "save_checkpoint", "understood"]
 
-FORMAT = 1
+FORMAT = 2
 _POINTER = "checkpoint.json"
 _STATE = re.compile(r"state-\d{6}\.npz")
 _OURS = re.compile(rf"{_STATE.pattern}|[a-z]+-\d{{6}}\.arrow")
@@ -56,7 +61,7 @@ def save_checkpoint(folder: Path, state: Mapping[str, Any], words: Mapping[str, 
     written = {"format": FORMAT, "journal": SCHEMA, "saltus": version("saltus"), "number": number, "state": name}
     temporary = folder / f".{_POINTER}.tmp"
     with temporary.open("w", encoding="utf-8") as text:
-        json.dump({**written, "words": words}, text)
+        json.dump({**written, "checksum": _checksum(words), "words": words}, text)
         text.flush()
         os.fsync(text.fileno())
     os.replace(temporary, folder / _POINTER)
@@ -84,6 +89,8 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         (folder / str(found["state"])).open("rb") as file,
         np.load(file, allow_pickle=False) as arrays,
     ):
+        if found["checksum"] != _checksum(found["words"]):
+            raise ValueError(f"{_POINTER} was changed after it was written")
         return nested({name: arrays[name] for name in arrays.files}), dict(found["words"])
 
 
@@ -94,11 +101,15 @@ def understood(folder: Path) -> Iterator[None]:
         yield
     except (OSError, EOFError, LookupError, TypeError, ValueError, AttributeError, StopIteration) as error:
         raise DataError(f"{folder}: the checkpoint there cannot be read: {error}. {_CURE}") from error
-    except zipfile.BadZipFile as error:
+    except (zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"{folder}: the checkpoint there is cut short or changed: {error}. {_CURE}") from error
 
 
 _CURE = "Begin anew without --resume."
+
+
+def _checksum(words: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(words).encode())
 
 
 def _pointer(folder: Path) -> dict[str, Any] | None:
@@ -107,7 +118,7 @@ def _pointer(folder: Path) -> dict[str, Any] | None:
         return None
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, ValueError) as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path}: no readable checkpoint: {error}. Begin anew.") from error
     if isinstance(found, dict) and isinstance(found.get("number"), int) and _STATE.fullmatch(str(found.get("state"))):
         return found
