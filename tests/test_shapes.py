@@ -5,13 +5,13 @@ import sys
 
 import numpy as np
 import pytest
-from jaxtyping import TypeCheckError
+from beartype.roar import BeartypeCallHintViolation
 
 from saltus.linalg import quadratic_form
 
 
 def test_a_shape_that_does_not_fit_is_found():
-    with pytest.raises(TypeCheckError):
+    with pytest.raises(BeartypeCallHintViolation):
         quadratic_form(np.ones((2, 3)), np.ones((3, 2)))  # B is square
     assert quadratic_form(np.ones((2, 3)), np.eye(3)).shape == (2, 2)
 

@@ -11,8 +11,11 @@ ISAS = [] if native_module() is None else native_module().instruction_sets()
 
 
 def pytest_generate_tests(metafunc):
+    absent = [pytest.param("", marks=pytest.mark.skip("the kernel was not built"))]
     if "isa" in metafunc.fixturenames:
-        metafunc.parametrize("isa", ISAS or [pytest.param("", marks=pytest.mark.skip("the kernel was not built"))])
+        metafunc.parametrize("isa", ISAS or absent)
+    if "other_isa" in metafunc.fixturenames:  # all but the widest, under which the other tests run
+        metafunc.parametrize("other_isa", ISAS[1:] or absent)
 
 
 @pytest.fixture(autouse=True)

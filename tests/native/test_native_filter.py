@@ -150,11 +150,11 @@ def test_a_forked_child_filters_on(rng):
     assert os.waitpid(child, 0)[1] == 0
 
 
-def test_reference_cases(isa, cases):
+def test_reference_cases(other_isa, cases):
     suite = Path(__file__).parents[1] / "filters" / "test_imm_cases.py"
     run = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(suite)],
-        env={**os.environ, "SALTUS_ISA": isa, "SALTUS_REQUIRE_NATIVE": "1"},
+        env={**os.environ, "SALTUS_ISA": other_isa, "SALTUS_REQUIRE_NATIVE": "1"},
         capture_output=True,
         text=True,
     )

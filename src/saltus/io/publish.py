@@ -185,9 +185,10 @@ def _read_manifest(folder: Path) -> _Manifest:
         return _Manifest({}, set())
 
 
-def _plain(names: list[str]) -> set[str]:
+def _plain(names: object) -> set[str]:
     """Return the names of files in the folder itself, whatever else a list of another's making holds."""
-    return {name for name in names if name == Path(name).name and name not in ("", "..") and "\0" not in name}
+    texts = [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    return {name for name in texts if name == Path(name).name and name not in ("", "..") and "\0" not in name}
 
 
 def _write_manifest(folder: Path, manifest: _Manifest) -> None:
