@@ -191,3 +191,10 @@ def test_the_noise_of_elevations_is_recovered_and_never_below_their_step(rng, si
     assert found.elevation == pytest.approx(sigma, rel=5.0 * 1.2 * 1.17 / np.sqrt(found.n_windows))
     coarse = Source(System(None, None, None, "grid"), elevation_lsb=float(np.radians(6.0)))
     assert apply_estimate(Noise(), found, coarse).elevation == pytest.approx(np.radians(6.0) / np.sqrt(12.0))
+
+
+def test_a_fine_elevation_is_taken_as_it_is():
+    """The least deviation is one of positions, m: of an angle it is what that is at some range."""
+    fine = NoiseEstimate(np.nan, np.nan, np.nan, np.nan, 99, elevation=float(np.radians(0.05)), range_rate=0.2)
+    used = apply_estimate(Noise(), fine, Source(System(None, None, None, "fine")))
+    assert used.elevation == pytest.approx(np.radians(0.05)) and used.range_rate == 0.2

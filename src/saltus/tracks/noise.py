@@ -15,7 +15,7 @@ _Array = npt.NDArray[np.float64]
 
 LEAST, _AT = 0.01, 5e3  # m, and m of range: what an aircraft flies while no clock of a sensor tells the time better
 
-_WINDOW = 7  # plots of one track
+_WINDOW, _INNER = 7, 5  # plots of one track; of what climbs bend as turns do positions, which no window leaves out
 _STEP = 2.0  # s, some, between those of a position: in less, what an aircraft's position errs by looks like a turn
 _FAST = 30.0  # m/s, from which errors of the time stamp show
 _MAX_ACCEL = 1.0  # m/s^2 over the window: straighter than any turn of an aircraft
@@ -87,14 +87,15 @@ def _estimated(
         straight = moving
     middle = window[whole, _WINDOW // 2][straight]
     found = _scatter(residual[straight], velocity[straight], m.ray[middle])
-    window, time = window[whole][straight], time[whole][straight]
+    inner = slice((_WINDOW - _INNER) // 2, (_WINDOW + _INNER) // 2)
+    window, time = window[whole][straight][:, inner], time[whole][straight][:, inner]
     return found._replace(
         elevation=_of_values(m.elevation[window], time), range_rate=_of_values(m.range_rate[window], time)
     )
 
 
 def _of_values(values: _Array, time: _Array) -> float:
-    """Return the standard deviation of what windows measure beside positions, (W, 7); NaN where too few do."""
+    """Return the standard deviation of what windows measure beside positions, (W, 5); NaN where too few do."""
     measured = np.isfinite(values).all(axis=1)
     if measured.sum() < _MIN_WINDOWS:
         return np.nan
@@ -107,10 +108,11 @@ def _middle_residuals(time: _Array, xy: _Array) -> tuple[_Array, _Array, _Array]
     scale = np.abs(time).max(axis=1, initial=0.0)[:, None]
     u = time / np.where(scale > 0, scale, 1.0)
     A = np.stack([np.ones_like(u), u, u * u], axis=-1)
-    pinv = np.linalg.pinv(A)  # (W, 3, 7)
-    centre = xy[:, _WINDOW // 2 : _WINDOW // 2 + 1]
+    pinv = np.linalg.pinv(A)  # (W, 3, plots)
+    middle = time.shape[1] // 2
+    centre = xy[:, middle : middle + 1]
     coefficients = pinv @ (xy - centre)
-    leverage = pinv[:, 0, _WINDOW // 2]  # the middle plot is at u = 0
+    leverage = pinv[:, 0, middle]  # the middle plot is at u = 0
     residual = -coefficients[:, 0] / np.sqrt(1.0 - leverage)[:, None]
     unit = np.maximum(scale[:, 0], 1e-9)
     return residual, coefficients[:, 1] / unit[:, None], 2.0 * np.linalg.norm(coefficients[:, 2], axis=-1) / unit**2
@@ -163,7 +165,7 @@ def apply_estimate(noise: Noise, estimate: NoiseEstimate, source: Source) -> Noi
         noise,
         range=at_least(estimate.range, source.range_lsb, noise.range),
         azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth, LEAST / _AT),
-        elevation=at_least(estimate.elevation, source.elevation_lsb, noise.elevation),
+        elevation=at_least(estimate.elevation, source.elevation_lsb, noise.elevation, LEAST / _AT),
         range_rate=at_least(estimate.range_rate, source.range_rate_lsb, noise.range_rate),
         xy=at_least(estimate.xy, source.xy_lsb, noise.xy),
         time=estimate.time if np.isfinite(estimate.time) else noise.time,
