@@ -22,6 +22,7 @@ import tempfile
 import weakref
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -88,7 +89,8 @@ class Journal:
         folder.mkdir(parents=True, exist_ok=True)
         for kind, sums in self._sealed.items():
             for k in range(len(sums)):
-                _write(folder / self._path(kind, k).name, self._path(kind, k).read_bytes())
+                with _whole(folder / self._path(kind, k).name) as temporary:
+                    shutil.copyfile(self._path(kind, k), temporary)
         self.close()
         self._folder = folder
 
@@ -122,12 +124,11 @@ class Journal:
         n = self._count[kind]
         for begin in range(0, n - _ROWS + 1, _ROWS):
             part = to_table({name: values[begin : begin + _ROWS] for name, values in columns.items()})
-            sink = pa.BufferOutputStream()
-            with pa.ipc.new_file(sink, part.schema) as writer:
-                writer.write_table(part)
-            sums, content = self._sealed.setdefault(kind, []), sink.getvalue().to_pybytes()
-            _write(self._path(kind, len(sums)), content)
-            sums.append(zlib.crc32(content))
+            sums = self._sealed.setdefault(kind, [])
+            with _whole(self._path(kind, len(sums))) as temporary:
+                with pa.OSFile(str(temporary), "wb") as sink, pa.ipc.new_file(sink, part.schema) as writer:
+                    writer.write_table(part)
+                sums.append(_checksum(temporary))
         rest = n - n % _ROWS
         self._waiting[kind] = [{name: values[rest:].copy() for name, values in columns.items()}]
         self._count[kind] = n % _ROWS
@@ -149,20 +150,28 @@ def foreign_columns(tracks: pa.Table) -> dict[str, _Array]:
 def _check(path: Path, checksum: int) -> None:
     """Refuse a segment that is not what was sealed."""
     try:
-        content = path.read_bytes()
+        found = _checksum(path)
     except OSError as error:
         raise DataError(
             f"{path}: the journal's segment cannot be read: {error}. Begin anew without --resume."
         ) from error
-    if zlib.crc32(content) != checksum:
+    if found != checksum:
         raise DataError(f"{path}: the journal's segment was changed after it was sealed. Begin anew without --resume.")
 
 
-def _write(path: Path, content: bytes) -> None:
-    """Write a file that is there as a whole or not at all."""
+def _checksum(path: Path) -> int:
+    found = 0
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            found = zlib.crc32(block, found)
+    return found
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Give a path to write to; the file is there as a whole or not at all."""
     temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
+    yield temporary
+    with temporary.open("rb+") as file:
         os.fsync(file.fileno())
     os.replace(temporary, path)

@@ -24,7 +24,7 @@ from saltus.run.seen import Seen
 
 __all__ = ["Feeding", "Followed", "fingerprint", "follow", "told_periods"]
 
-_CHUNK, _OFTEN = 50_000, 1_000  # reports fed at a time, and where states are saved in between
+_CHUNK, _OFTEN = 10_000, 1_000  # reports fed at a time, and where states are saved in between
 
 
 @dataclass(frozen=True, slots=True)
