@@ -1,4 +1,4 @@
-"""What becomes of ill-conditioned models and outliers? Ten million filter steps of them, shared by both backends.
+"""What becomes of ill-conditioned models and outliers? Ten million filter steps of them answered, by both backends.
 
 Every run has a model of its own (`tests/strategies.hostile_problem`): ratios of variances over 32 decades, covariances
 of any rank, components without noise, more measurements than states, outliers up to overflow. Prints how far
@@ -77,21 +77,22 @@ def filtered(p: dict[str, object], backend: str, tally: Tally) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=float, default=1e7, help="of all backends together")
+    parser.add_argument("--steps", type=float, default=1e7, help="answered, of all backends together")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     backends = ["numpy"] if native_module() is None else ["numpy", "native"]
     tallies = {name: Tally() for name in backends}
-    rng, done = np.random.default_rng(args.seed), 0
-    while done < args.steps:
+    rng, begun = np.random.default_rng(args.seed), 0
+    while sum(t.steps for t in tallies.values()) < args.steps:
         n = int(rng.integers(1, 10))
         m, rows, decades = int(rng.integers(1, n + 3)), int(rng.integers(1, 21)), (2.0, 8.0)[rng.integers(2)]
         sizes, farthest = CHAINS[rng.integers(len(CHAINS))], FARTHEST[rng.integers(len(FARTHEST))]
         p = hostile_problem(rng, 2000, sizes, n, m, rows, decades, farthest)
         for name, tally in tallies.items():
             filtered(p, name, tally)
-        done += 2000 * rows * len(tallies)
-    print(f"{done:,} steps, seed {args.seed}")
+        begun += 2000 * rows * len(tallies)
+    answered = sum(t.steps for t in tallies.values())
+    print(f"{answered:,} steps answered, of runs of {begun:,} steps, seed {args.seed}")
     print("| backend | steps answered | worst \\|sum p - 1\\| | least eigenvalue | not finite | CPU s |")
     print("|---|---|---|---|---|---|")
     for name, t in tallies.items():

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -166,6 +167,19 @@ def test_a_reader_that_has_enough_ends_the_program_quietly(recording, tmp_path):
     os.close(write)
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "out" / "tracks.parquet").exists()
+
+
+@pytest.mark.parametrize("files", [3, 4, 5, 6])
+def test_a_limit_on_open_files_is_named_or_suffices(recording, tmp_path, files):
+    """From where the program starts: three are the standard streams, and no more can be opened."""
+    path, config = recording
+    arguments = ["track", path, "-o", tmp_path / "out", "--config", config, "--no-report"]
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_NOFILE, ({files}, {files}))"
+    code = f"from saltus.cli import main; {limited}; main()"
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+    said = r"saltus: Too many open files(: \S+)?; raise the limit on open files \(ulimit -n\)\n"
+    assert (done.returncode == 0 and files > 3) or (done.returncode == 2 and re.fullmatch(said, done.stderr)), done
+    assert (tmp_path / "out").exists() == (done.returncode == 0)
 
 
 @pytest.fixture

@@ -29,8 +29,8 @@ _FILE = _Path()
 class _Group(click.Group):
     def invoke(self, ctx: click.Context) -> object:
         """Turn every expected failure into one clear line and a non-zero exit status."""
-        usable_streams()
         try:
+            usable_streams()
             with stoppable():
                 outcome = super().invoke(ctx)
                 sys.stdout.flush()

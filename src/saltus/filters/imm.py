@@ -68,7 +68,10 @@ def imm_filter(
     Raises:
         ModelError: a shape or a law that cannot be; the message says how it was read and how to mend it.
         DataError: inf in z, NaN or inf elsewhere.
-        NumericalError: an innovation covariance is not positive definite.
+        NumericalError: an innovation covariance is not positive definite: less than (8 eps)^2 of the squares that a
+            component's variance is the sum of is left after the components before it, so that it is known without
+            error, as by two measurements without noise that must agree. Within rounding of that bound the two backends
+            may differ: one refuses what the other answers. With noise in every component they refuse the same.
 
     Source: Detkov (2023), equations 3.1-3.15 as corrected in the fusion notes; Blom and Bar-Shalom (1988).
     """
