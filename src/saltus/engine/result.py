@@ -138,8 +138,11 @@ def _rows(columns: dict[str, npt.NDArray[Any]]) -> Rows:
 
 
 def _fates(journal: Journal, own: int) -> Fates:
+    number, which = np.zeros(0, np.int64), np.zeros(0, bool)
+    none = Fates(number, number, which, which)  # amid a recording nothing may be known yet
     parts = [_chosen(p, p["system"] == own) for p in journal.parts("fates")]
-    return Fates(*(np.concatenate([p[name] for p in parts]) for name in Fates._fields))
+    told = [none, *(Fates(*(p[name] for name in Fates._fields)) for p in parts)]
+    return Fates(*(np.concatenate(column) for column in zip(*told, strict=True)))
 
 
 def _confirmed(journal: Journal, own: int) -> _Index:
