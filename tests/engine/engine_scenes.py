@@ -1,6 +1,7 @@
 """Reports of simulated radars, for sessions."""
 
 import numpy as np
+import pyarrow as pa
 
 from saltus.demo import write_demo
 from saltus.geo import Plane, Site
@@ -36,10 +37,9 @@ def demo_start(folder, seed, share=0.5):
     return [*map(str, files)], config
 
 
-def scene(radars, seed=1, seconds=SECONDS):
-    """Reports of radars that see eight aircraft, with clutter, in order of time."""
-    rng = np.random.default_rng(seed)
-    flights = [
+def aircraft(rng, seconds):
+    """Eight flights, each with a turn."""
+    return [
         Trajectory(
             (*rng.uniform(-4e4, 4e4, 2).tolist(), float(rng.uniform(3e3, 1e4))),
             float(rng.uniform(0.0, 6.28)),
@@ -48,6 +48,30 @@ def scene(radars, seed=1, seconds=SECONDS):
         )
         for _ in range(8)
     ]
+
+
+def centre(seed=1, seconds=SECONDS, period=4.0):
+    """Tracks of another centre of the aircraft that `scene` with this seed has, 50 m wrong, in order of time."""
+    rng = np.random.default_rng(seed)
+    flights, errors = aircraft(rng, seconds), np.random.default_rng(seed + 1)
+    times = np.arange(1.0, seconds, period)
+    rows = []
+    for k, flight in enumerate(flights):
+        motion = flight.at(times)
+        place = motion.position[:, :2] + errors.normal(0.0, 50.0, 2)
+        latitude, longitude = np.degrees(PLANE.inverse(place))
+        rows += zip(times, [k + 100] * len(times), latitude, longitude, *motion.velocity[:, :2].T, strict=True)
+    names = ("time", "track_number", "latitude", "longitude", "vx", "vy")
+    columns = dict(zip(names, zip(*sorted(rows), strict=True), strict=True))
+    none = [None] * len(rows)
+    same = {"system": ["CAT062:1/9"] * len(rows), "coasted": [0.0] * len(rows), "mode3a": none, "icao24": none}
+    return pa.table({**columns, **same})
+
+
+def scene(radars, seed=1, seconds=SECONDS):
+    """Reports of radars that see eight aircraft, with clutter, in order of time."""
+    rng = np.random.default_rng(seed)
+    flights = aircraft(rng, seconds)
     codes = np.array([*(0x3C6444 + np.arange(4)), -1, -1, -1, -1, -1], np.int32)
     columns = {}
     for k in range(radars):
