@@ -70,7 +70,7 @@ class Run(NamedTuple):
 
 
 def run(folder: Path, names: Sequence[str], identity: str) -> Run:
-    """Track files of a folder and join the reports with the assignments, which are in their order."""
+    """Track files of a folder and join the reports with the assignments."""
     config = load_config(folder / "sensors.toml")
     files = [folder / name for name in names]
     with tempfile.TemporaryDirectory() as out:
@@ -79,10 +79,13 @@ def run(folder: Path, names: Sequence[str], identity: str) -> Run:
         found = pq.read_table(Path(out) / "identifications.parquet").to_pylist()
         biases = json.loads((Path(out) / "biases.json").read_text())["systems"]
     plots = io.read(files, date=config.date, editions=config.editions).plots
-    np.testing.assert_array_equal(assigned["record"].to_numpy(), plots.record)
+    names = [Path(name).name for name in assigned["source"].to_pylist()]
+    told = zip(names, assigned["category"].to_pylist(), assigned["record"].to_pylist(), strict=True)
+    of = dict(zip(told, assigned["track_id"].fill_null(-1).to_pylist(), strict=True))
+    track = [of[Path(plots.files[f]).name, c, r] for f, c, r in _keys(plots)]
     seconds = summary["seconds"]
     assert isinstance(seconds, dict)
-    return Run(plots, assigned["track_id"].fill_null(-1).to_numpy(), found, biases, seconds["tracking"])
+    return Run(plots, np.array(track, np.int64), found, biases, seconds["tracking"])
 
 
 def position(folder: Path, names: Sequence[str]) -> tuple[Plots, Index, Array]:

@@ -31,9 +31,13 @@ class LocalTracking:
         self._tracker.adopt(setup.tracker(party))
         return fed
 
+    def own(self, m: Measurements) -> npt.NDArray[np.intp]:
+        """Return the places of the system's own measurements."""
+        return np.flatnonzero(np.isin(m.source, self._own))
+
     def feed(self, m: Measurements) -> Fed:
-        """Take measurements of all systems in order of time."""
-        return self._tracker.feed(m.take(np.flatnonzero(np.isin(m.source, self._own))))
+        """Take measurements of all systems in order of time; slices that end before the last of them are complete."""
+        return self._tracker.feed(m.take(self.own(m)), float(m.time.max(initial=-np.inf)))
 
     def end(self) -> Fed:
         """Tell what waits."""

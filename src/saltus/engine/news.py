@@ -1,12 +1,13 @@
 """What is published when it becomes known: rows of tracks, and what became of reports."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from saltus.engine.live import APART
 from saltus.engine.setup import Setup
 from saltus.geo import Plane
 from saltus.records import REASONS, Plots
@@ -18,7 +19,6 @@ __all__ = ["News"]
 _Index = npt.NDArray[np.int64]
 _Array = npt.NDArray[Any]
 
-_SYSTEM = 10**12  # between the numbers of the tracks of two systems
 _COLUMNS = ("time", "source", "file", "record", "reason")
 
 
@@ -53,18 +53,26 @@ class News:
 
     def tell(self, system: int, fed: Fed) -> None:
         """Take what the tracker of a system knows anew; the first system's tracks keep their numbers."""
-        above = system * _SYSTEM
+        above = system * APART
         self._rows.append(fed.rows._replace(track_id=fed.rows.track_id + above))
         track = np.where(fed.fates.track_id > 0, fed.fates.track_id + above, 0)
         self._fates.append((fed.fates.plot, track, _reasons(fed.fates)))
 
-    def taken(self, setup: Setup | None, referred: Sequence[_Index]) -> tuple[pa.Table, pa.Table]:
+    def taken(
+        self, setup: Setup | None, referred: Sequence[_Index], named: Callable[[_Index], _Index] | None = None
+    ) -> tuple[pa.Table, pa.Table]:
         """Return rows of tracks and fates of reports since the last time; keep only the reports referred to.
 
         Args:
             setup: that holds; None while there is none.
             referred: numbers of the reports whose fate may still be told; all are, while there is no setup.
+            named: gives the numbers known now of tracks of several systems.
         """
+        if named is not None:
+            self._rows = [rows._replace(track_id=named(rows.track_id)) for rows in self._rows]
+            self._fates = [
+                (plot, np.where(track > 0, named(track), 0), reasons) for plot, track, reasons in self._fates
+            ]
         rows, assigned = self._row_table(setup), self._fate_table()
         if setup is not None:
             stay = np.isin(self._number, np.concatenate([np.zeros(0, np.int64), *referred]))

@@ -18,6 +18,7 @@ from saltus.engine.identified import (
     trusted,
 )
 from saltus.engine.journal import Journal
+from saltus.engine.live import Heard
 from saltus.engine.setup import Setup
 from saltus.records import Plots
 from saltus.tracks.faults import History, plot_law
@@ -28,7 +29,7 @@ from saltus.tracks.noise import estimate_noise
 from saltus.tracks.output import assignment_table, innovation_table, track_table
 from saltus.tracks.rows import ConditionFound, Fates, Rows, Tracked, assignments, join_rows
 
-__all__ = ["Result", "finished", "order_of_systems"]
+__all__ = ["Result", "finished", "heard_so_far", "order_of_systems"]
 
 _Index = npt.NDArray[np.int64]
 
@@ -77,6 +78,19 @@ def finished(journal: Journal, setup: Setup, files: Sequence[str], health: dict[
         tracked=joined,
         whole=whole,
     )
+
+
+def heard_so_far(journal: Journal, setup: Setup) -> list[tuple[int, Heard]]:
+    """Return the measurements and rows of each system, by its first source."""
+    reports = journal.all("reports") or {"local_id": np.zeros(0, np.int64)}
+    out = []
+    for party in setup.parties():
+        placed = [_chosen(part, np.isin(part["source"], party.sources)) for part in journal.parts("plots")]
+        if any(len(part["plot"]) for part in placed):
+            m, own = Measurements.join([Measurements(**part) for part in placed]), party.sources[0]
+            rows = join_rows([_rows(_chosen(p, p["system"] == own)) for p in journal.parts("rows")])
+            out.append((own, Heard(m, np.asarray(reports["local_id"], np.int64)[m.plot], rows)))
+    return out
 
 
 def order_of_systems(journal: Journal, setup: Setup, files: Sequence[str]) -> tuple[str, ...]:

@@ -15,9 +15,10 @@ from saltus.engine.identified import IDENTIFICATIONS
 from saltus.engine.intake import Arrived, Intake, Leap, numbered
 from saltus.engine.journal import Journal, foreign_columns
 from saltus.engine.learn import first_setup, usable, with_new_sources
+from saltus.engine.live import Heard, Live, replayed
 from saltus.engine.local import LocalTracking
 from saltus.engine.news import News
-from saltus.engine.result import Result, finished, order_of_systems
+from saltus.engine.result import Result, finished, heard_so_far, order_of_systems
 from saltus.engine.saved import saved_setup
 from saltus.engine.setup import Setup, site_of
 from saltus.engine.stored import config_from, setup_from, setup_state, source_from, source_words
@@ -26,6 +27,7 @@ from saltus.engine.vetting import Vetting
 from saltus.errors import DataError
 from saltus.progress import Progress
 from saltus.records import REASONS, Plots, Source
+from saltus.tracks.measurements import Measurements
 from saltus.tracks.rows import Fed, Rows
 
 __all__ = ["Published", "Session"]
@@ -59,6 +61,7 @@ class Session:
     """
 
     _vetting: Vetting | None
+    _live: Live | None  # of several systems
 
     def __init__(self, setup: Setup, *, hold: float = _HOLD, folder: Path | None = None) -> None:
         """Begin with a setup.
@@ -81,6 +84,7 @@ class Session:
         hold: float = _HOLD,
         folder: Path | None = None,
         bar: Progress | None = None,
+        running: bool = True,
     ) -> "Session":
         """Begin without a setup: it is learnt from the first stretch of reports, which is then tracked under it.
 
@@ -92,12 +96,14 @@ class Session:
             hold: s that a report may come late; 0: reports come in order of time.
             folder: of the journal; None: a temporary one.
             bar: shows progress.
+            running: whether `feed` tells of several systems which tracks are one; `finish` does in any case.
         """
         session = cls.__new__(cls)
         known = config if isinstance(config, Config) else load_config(config)
         setup = saved_setup(known, use_identity=use_identity)
         known = known.model_copy(update={"learnt": None})
         session._begin(known, use_identity, periods or {}, hold, folder, bar or Progress())
+        session._running = running
         if setup is not None:
             session._take_setup(setup)
         return session
@@ -127,6 +133,7 @@ class Session:
         self._setups: list[Setup] = []
         self._locals: dict[int, LocalTracking] = {}  # by the first source of each system
         self._news = News()
+        self._running, self._live = True, None
         self.notes: dict[str, Any] = {}  # what the caller of `save` wanted to find again
         self._ended = False
         self._vetting = None
@@ -269,6 +276,7 @@ class Session:
         self._track(plots, number)
         order = order_of_systems(self._journal, self._setups[-1], self._files)
         self._setups = [replace(setup, order=order) for setup in self._setups]
+        self._look()
 
     def _of_sources(self, plots: Plots, count: int) -> Plots:
         """Reports of the first `count` sources: what comes later has no say in what is done before."""
@@ -285,6 +293,8 @@ class Session:
                 self._tell(own, self._locals[own].adopt(setup, party))
             else:
                 self._locals[own] = LocalTracking(setup, party)
+        if self._live is not None:
+            self._live.adopt(setup, list(self._locals))
 
     def _track(self, plots: Plots, number: _Index) -> None:
         """Track reports in order of time, under a new setup from where a new source appears."""
@@ -295,8 +305,12 @@ class Session:
             stop = int(new[0]) if len(new) else len(plots)
             m = setup.placed(self._of_sources(plots.take(slice(0, stop)), len(setup.sensors)), number[:stop])
             self._journal.append("plots", m.columns())
+            order = np.argsort(number[:stop], kind="stable")
+            local_id = plots.local_id[order[np.searchsorted(number[order], m.plot)]].astype(np.int64)
             for own, tracking in self._locals.items():
-                self._tell(own, tracking.feed(m))
+                mine = tracking.own(m)
+                self._tell(own, tracking.feed(m), m.take(mine), local_id[mine])
+            self._look()
             plots, number = plots.take(slice(stop, None)), number[stop:]
             if len(plots):
                 self._appeared(int(plots.source[0]), float(plots.time[0]))
@@ -310,8 +324,20 @@ class Session:
         sensors[source] = replace(sensors[source], heard=True, appeared=time)
         self._adopt(replace(setup, time=time, sensors=tuple(sensors)))
 
-    def _tell(self, own: int, fed: Fed) -> None:
-        """Note what a tracker knows anew."""
+    def _look(self) -> None:
+        """Look at several systems; the running picture of them begins when there are two."""
+        if self._running and self._live is None and self.setup.order and len(self._locals) > 1:
+            self._live = Live(self.setup, list(self._locals))
+            for own, heard in heard_so_far(self._journal, self.setup):
+                self._live.take(own, heard)
+        if self._live is not None:
+            self._live.look()
+
+    def _tell(self, own: int, fed: Fed, m: Measurements | None = None, local_id: _Index | None = None) -> None:
+        """Note what a tracker knows anew, after it was given measurements."""
+        if self._live is not None:
+            heard = self._live.nothing if m is None or local_id is None else Heard(m, local_id, fed.rows)
+            self._live.take(own, heard._replace(rows=fed.rows))
         columns = {name: getattr(fed.rows, name) for name in Rows._fields if name != "moments"}
         self._journal.append("rows", {**columns, **fed.rows.moments._asdict(), "system": _all(own, fed.rows.time)})
         self._journal.append("fates", {**fed.fates._asdict(), "system": _all(own, fed.fates.plot)})
@@ -326,8 +352,9 @@ class Session:
 
     def _published(self) -> Published:
         kept = [tracking.referred() for tracking in self._locals.values()]
-        tables = self._news.taken(self._setups[-1] if self._setups else None, kept)
-        return Published(*tables, IDENTIFICATIONS.empty_table(), self.health())
+        live = self._live
+        tables = self._news.taken(self._setups[-1] if self._setups else None, kept, live.named if live else None)
+        return Published(*tables, live.taken() if live else IDENTIFICATIONS.empty_table(), self.health())
 
     def save(self, folder: Path | str, words: Mapping[str, Any] | None = None) -> None:
         """Save the session: `restore` goes on from here as if nothing had been.
@@ -364,6 +391,8 @@ class Session:
             "files": self._files,
             "reports": self._n,
             "setups": [words for _, words in setups],
+            "running": self._running,
+            "looked": None if self._live is None else self._live.looked,
             "leaps": [leap._asdict() for leap in self._intake.leaps],
             "notes": dict(words or {}),
         }
@@ -382,7 +411,7 @@ class Session:
         with understood(folder):
             config = config_from(words["config"])
             session._begin(config, words["use_identity"], words["periods"], words["hold"], folder, bar or Progress())
-            session.notes = words["notes"]
+            session.notes, session._running = words["notes"], words["running"]
             session._sources.extend(source_from(s) for s in words["sources"])
             session._files.extend(words["files"])
             session._n = int(words["reports"])
@@ -400,6 +429,9 @@ class Session:
                 party = next(p for p in session.setup.parties() if p.sources[0] == int(own))
                 session._locals[int(own)] = LocalTracking(session.setup, party)
                 session._locals[int(own)].restore(local)
+            if words["looked"] is not None:
+                live = Live(session.setup, list(session._locals))
+                session._live = replayed(live, heard_so_far(session._journal, session.setup), words["looked"])
         return session
 
 

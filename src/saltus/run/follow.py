@@ -139,7 +139,8 @@ def _session(
         begin_anew(folder)
         if feeding.resume:
             lines.append(f"{folder} holds no state yet: begun from the first report.")
-    return Session.open(config, use_identity=use_identity, hold=0.0, folder=folder, bar=bar), lines
+    session = Session.open(config, use_identity=use_identity, hold=0.0, folder=folder, bar=bar, running=False)
+    return session, lines
 
 
 def _changed(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:

@@ -50,7 +50,8 @@ def setup_files(
         raise DataError(f"{output}: would be overwritten, and is what the setup is made of. Give another -o.")
     with progress_bar() as bar, output_file(output) as path:
         config = load_config(config_path, date=date, framing=framing).model_copy(update={"learnt": None})
-        session, seen = Session.open(config, use_identity=identity == "use", hold=0.0, bar=bar), Seen(config)
+        session = Session.open(config, use_identity=identity == "use", hold=0.0, bar=bar, running=False)
+        seen = Seen(config)
         for piece in config.read_in_order(inputs, bar.reading):
             seen.add(piece)
             session.tell_periods(told_periods(seen.contents))

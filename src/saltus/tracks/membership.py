@@ -8,7 +8,7 @@ counter; an object's number is the least of its pieces', measured ones first. So
 report, and the number that a piece had before it was found to be a part of an older object is merged into that one's.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -20,6 +20,8 @@ from saltus.shapes import Float, Int
 __all__ = ["Change", "Local", "Membership", "Merger", "Segments", "known_since"]
 
 _Array = npt.NDArray[np.float64]
+
+_FOREIGN = 10**15  # numbers of another centre's tracks, which are never published, begin here
 
 
 class Segments(NamedTuple):
@@ -40,7 +42,8 @@ class Segments(NamedTuple):
         life = float(self.time_to.max()) - start + 1.0
         axis = self.track * life + (self.time_from - start)
         at = track * life + np.clip(time - start, 0.0, life - 0.5)
-        return np.asarray(np.searchsorted(axis, at, side="right") - 1)
+        first = np.searchsorted(self.track, track)
+        return np.asarray(np.maximum(np.searchsorted(axis, at, side="right") - 1, first))
 
 
 class Merger(NamedTuple):
@@ -102,17 +105,28 @@ class Membership:
         self._links: dict[int, list[_Link]] = {}
         self._spans: dict[int, list[_Span]] = {}  # what holds now
         self._ended: dict[int, float] = {}  # s: last report of each track that has
-        self._next = 1
+        self._next = {False: 1, True: _FOREIGN}
+        self._touched: set[int] = set()  # tracks with news that nobody has taken
         self.mergers: list[Merger] = []
         self.changes: list[Change] = []
 
     def birth(self, k: int, local: Local, known: float) -> None:
         """A local track is confirmed."""
         self._local[k], self._links[k] = local, []
-        self._cuts[k], self._number[k] = [local.begin], [self._next]
-        self._spans[k] = [_Span(local.begin, self._next, 1.0, known)]
-        self.changes.append(Change(self._next, local.begin, known))
-        self._next += 1
+        number = self._numbered(k)
+        self._cuts[k], self._number[k] = [local.begin], [number]
+        self._spans[k] = [_Span(local.begin, number, 1.0, known)]
+        self.changes.append(Change(number, local.begin, known))
+        self._touched.add(k)
+
+    def _numbered(self, k: int) -> int:
+        foreign = self._local[k].foreign
+        self._next[foreign] += 1
+        return self._next[foreign] - 1
+
+    def born_as(self, k: int) -> int:
+        """Return the number that a local track got when it was confirmed."""
+        return self._number[k][0]
 
     def join(self, a: int, b: int, since: float, known: float, probability: float) -> None:
         """Two local tracks are one object since a time.
@@ -190,8 +204,7 @@ class Membership:
         if place < len(self._cuts[k]) and self._cuts[k][place] == at:
             return
         self._cuts[k].insert(place, at)
-        self._number[k].insert(place, self._next)
-        self._next += 1
+        self._number[k].insert(place, self._numbered(k))
 
     def _clash(self, a: int, b: int, since: float) -> bool:
         """Say whether the objects of two tracks at a time have different addresses."""
@@ -234,6 +247,7 @@ class Membership:
 
     def _renew(self, tracks: set[int], known: float) -> None:
         """Find the numbers of tracks anew; note what is new since `known`."""
+        self._touched |= tracks
         before = {k: self._spans[k] for k in tracks}
         names: dict[_Piece, _Piece] = {}
         for k in sorted(tracks):
@@ -275,10 +289,20 @@ class Membership:
         mine = [x.probability for x in self._links[piece.track] if max(begin, x.begin) < min(end, x.end)]
         return float(np.clip(max(mine, default=1.0), 0.0, 1.0))
 
-    def segments(self, end: _Array) -> Segments:
-        """Return what holds now; `end` is the time of the last report of each local track, s."""
+    def current(self, k: int) -> int:
+        """Return the number that a local track has now."""
+        return self._spans[k][-1].number
+
+    def news(self, end: _Array, since: float) -> tuple[Segments, list[Merger]]:
+        """Take what became known after `since`; `end` is the time of the last report of each local track, s."""
+        found, mergers = self.segments(end, self._touched), [m for m in self.mergers if m.known > since]
+        self._touched = set()
+        return Segments(*(column[found.time_known > since] for column in found)), mergers
+
+    def segments(self, end: _Array, tracks: Collection[int] | None = None) -> Segments:
+        """Return what holds now, of some local tracks or all; `end` is the time of the last report of each, s."""
         rows = []
-        for k in sorted(self._spans):
+        for k in sorted(self._spans if tracks is None else tracks):
             last = float(end[k])
             spans = [s for s in self._spans[k] if s.begin < last] or self._spans[k][:1]
             stops = [*(s.begin for s in spans[1:]), last]

@@ -18,7 +18,7 @@ from saltus.identify import (
 from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.identities import Compared, Looked, Weigher
 from saltus.tracks.local import LocalSystem
-from saltus.tracks.membership import Local, Membership
+from saltus.tracks.membership import Local, Membership, Merger, Segments
 from saltus.tracks.settings import FilterSettings, RegistrationSettings, SystemsSettings
 from saltus.tracks.systems import Frames, Region, Registered
 
@@ -73,7 +73,7 @@ class Picture:
         self._decider = Decider(decision_settings(settings))
         self.membership = Membership()
         self._regions = [Region() for _ in names]
-        self._before = -np.inf
+        self._before = self._asked = -np.inf
         self.number: dict[tuple[int, int], int] = {}  # of a system's local track
         self._of: list[int] = []  # system of each track
         self._last: list[float] = []
@@ -82,6 +82,21 @@ class Picture:
         self._alive, self._looks = 0, 0  # tracks of the fullest system, summed over looks
         self._ended: list[Episodes] = []
         self._said: list[Looked] = []
+
+    def add(self, name: str, period: float) -> None:
+        """Take in a system that appears later."""
+        self._frames.add(name)
+        self._periods.append(period)
+        self._regions.append(Region())
+
+    @property
+    def kept(self) -> float:
+        """S of rows that a look needs."""
+        return max(self._settings.window, 8.0 * max(self._periods), self._expected.interval + _KEPT)
+
+    def news(self) -> tuple[Segments, list[Merger]]:
+        """Take what the last look found about the numbers of local tracks."""
+        return self.membership.news(np.array(self._last), self._asked)
 
     def look(self, now: float, systems: Sequence[LocalSystem]) -> None:
         """Take in what is known by `now`.
@@ -99,7 +114,7 @@ class Picture:
             self._frames.update(now, views)
         said = self._weigh(now, systems, views)
         self._decide(now, said)
-        self._before = now
+        self._asked, self._before = self._before, now
 
     def close(self, systems: Sequence[LocalSystem]) -> None:
         """Number the tracks confirmed since the last look."""
@@ -175,9 +190,8 @@ class Picture:
     def _view(self, k: int, system: LocalSystem, now: float) -> SystemTracks:
         """Return the latest rows of a system that are known, under the numbers of all."""
         view, tracks = system.view, system.view.tracks
-        kept = max(self._settings.window, 8.0 * max(self._periods), self._expected.interval + _KEPT)
         known = np.maximum(system.known, system.ready[tracks.track])
-        at = np.flatnonzero((known <= now) & (tracks.time >= now - kept))
+        at = np.flatnonzero((known <= now) & (tracks.time >= now - self.kept))
         every = np.array([self.number.get((k, own), -1) for own in system.ids.tolist()], np.int64)
         number = every[tracks.track[at]]
         order = np.argsort(number, kind="stable")

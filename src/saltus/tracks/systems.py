@@ -54,13 +54,25 @@ class Frames:
             speed: standard deviation of each component of an object's velocity, m/s.
             expected: biases.
         """
-        pairing = PairSettings(speed_sigma=speed)
+        self._pairing, self._expected = PairSettings(speed_sigma=speed), expected
         self._names, self._order = list(names), list(order)
-        pairs = [(k, j) for at, k in enumerate(order) for j in order[:at]]
-        self._compared = {pair: Comparison(pairing, expected) for pair in pairs}
-        self._series = {k: Series(expected.prior) for k in order[1:]}
-        self._by = {k: order[0] for k in order[1:]}
-        self._known = {k: self._series[k].registration() for k in order[1:]}
+        self._compared: dict[tuple[int, int], Comparison] = {}
+        self._series: dict[int, Series] = {}
+        self._by: dict[int, int] = {}
+        self._known: dict[int, Registration] = {}
+        for at, k in enumerate(order[1:], start=1):
+            self._begin(k, order[:at])
+
+    def _begin(self, k: int, partners: Sequence[int]) -> None:
+        self._compared |= {(k, j): Comparison(self._pairing, self._expected) for j in partners}
+        self._series[k], self._by[k] = Series(self._expected.prior), self._order[0]
+        self._known[k] = self._series[k].registration()
+
+    def add(self, name: str) -> None:
+        """Take in a system that appears later, less trusted than all before."""
+        self._begin(len(self._names), self._order)
+        self._order.append(len(self._names))
+        self._names.append(name)
 
     def update(self, now: float, views: Sequence[SystemTracks]) -> None:
         """Estimate all biases anew from the latest rows of all systems, as reported."""
