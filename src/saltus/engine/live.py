@@ -72,12 +72,16 @@ class Live:
     part in it.
     """
 
-    def __init__(self, setup: Setup, first: Sequence[int]) -> None:
+    def __init__(
+        self, setup: Setup, first: Sequence[int], heard: Iterable[tuple[int, Heard]], looked: float = -np.inf
+    ) -> None:
         """Begin with systems that have reported.
 
         Args:
             setup: of the sources.
             first: the first source of each system, in the order in which systems are numbered.
+            heard: what was heard of systems so far, by their first sources.
+            looked: number of the last look whose news have been taken.
         """
         parties = {party.sources[0]: party for party in setup.parties()}
         self._setup, self._parties = setup, [parties[own] for own in first]
@@ -88,13 +92,18 @@ class Live:
         self._picture = Picture(names, order, periods, config.systems, config.registration, config.filter)
         none = np.zeros(0, np.int64)
         empty = Plots.build(0, tuple(s.source for s in setup.sensors), (), {})
-        self.nothing = Heard(setup.placed(empty, none), none, join_rows([]))
-        self._recent = [_Recent(name, self.nothing) for name in names]
+        self._nothing = Heard(setup.placed(empty, none), none, join_rows([]))
+        self._recent = [_Recent(name, self._nothing) for name in names]
         self._look = -np.inf  # number of the last look
         self._newest = -np.inf
         self._labels: dict[int, str] = {}
         self._announced = 0  # local tracks whose number was told
         self._news: list[dict[str, Any]] = []
+        for own, part in heard:
+            self.take(own, part)
+        if np.isfinite(looked):
+            self.look(looked)
+            self.taken()
 
     @property
     def looked(self) -> float:
@@ -107,8 +116,12 @@ class Live:
         parties = {party.sources[0]: party for party in setup.parties()}
         for own in first[len(self._parties) :]:
             self._parties.append(parties[own])
-            self._recent.append(_Recent(parties[own].name, self.nothing))
+            self._recent.append(_Recent(parties[own].name, self._nothing))
             self._picture.add(parties[own].name, _period(setup, parties[own]))
+
+    def heard(self, rows: Rows, m: Measurements | None, local_id: _Index | None) -> Heard:
+        """Return what is known anew of a system, without measurements where there are none."""
+        return self._nothing._replace(rows=rows) if m is None or local_id is None else Heard(m, local_id, rows)
 
     def take(self, own: int, heard: Heard) -> None:
         """Take what is known anew of the system whose first source is `own`."""
@@ -197,18 +210,3 @@ class Live:
 
 def _period(setup: Setup, party: Party) -> float:
     return min(setup.sensors[s].period for s in party.sources if setup.sensors[s].heard)
-
-
-def replayed(live: Live, parts: Iterable[tuple[int, Heard]], last: float) -> Live:
-    """Take what was heard before, and look as often as had been looked.
-
-    Args:
-        live: just begun.
-        parts: first source of each system, and what was heard of it.
-        last: number of the last look.
-    """
-    for own, heard in parts:
-        live.take(own, heard)
-    live.look(last)
-    live.taken()
-    return live

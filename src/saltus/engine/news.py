@@ -1,7 +1,7 @@
 """What is published when it becomes known: rows of tracks, and what became of reports."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,12 +14,21 @@ from saltus.records import REASONS, Plots
 from saltus.tracks.output import ELSEWHERE, NOT_CONFIRMED, SPLIT, report_table, track_table
 from saltus.tracks.rows import Fates, Fed, Rows, join_rows
 
-__all__ = ["News"]
+__all__ = ["News", "Published"]
 
 _Index = npt.NDArray[np.int64]
 _Array = npt.NDArray[Any]
 
 _COLUMNS = ("time", "source", "file", "record", "reason")
+
+
+class Published(NamedTuple):
+    """What became known with the reports fed."""
+
+    tracks: pa.Table
+    assignments: pa.Table
+    identifications: pa.Table
+    health: dict[str, Any]
 
 
 class News:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,15 +12,16 @@ import pyarrow as pa
 from saltus.config import Config, load_config
 from saltus.engine.checkpoint import begin_anew, load_checkpoint, save_checkpoint, understood
 from saltus.engine.identified import IDENTIFICATIONS
-from saltus.engine.intake import Arrived, Intake, Leap, numbered
+from saltus.engine.intake import Arrived, Intake, Leap
 from saltus.engine.journal import Journal, foreign_columns
-from saltus.engine.learn import first_setup, usable, with_new_sources
-from saltus.engine.live import Heard, Live, replayed
+from saltus.engine.learn import first_setup, with_new_sources
+from saltus.engine.live import Live
 from saltus.engine.local import LocalTracking
-from saltus.engine.news import News
+from saltus.engine.news import News, Published
+from saltus.engine.noted import local_ids, note_fed, placeable, renumbered
 from saltus.engine.result import Result, finished, heard_so_far, order_of_systems
 from saltus.engine.saved import saved_setup
-from saltus.engine.setup import Setup, site_of
+from saltus.engine.setup import Setup
 from saltus.engine.stored import config_from, setup_from, setup_state, source_from, source_words
 from saltus.engine.stretch import Stretch
 from saltus.engine.vetting import Vetting
@@ -28,7 +29,7 @@ from saltus.errors import DataError
 from saltus.progress import Progress
 from saltus.records import REASONS, Plots, Source
 from saltus.tracks.measurements import Measurements
-from saltus.tracks.rows import Fed, Rows
+from saltus.tracks.rows import Fed
 
 __all__ = ["Published", "Session"]
 
@@ -36,16 +37,7 @@ _Index = npt.NDArray[np.int64]
 
 _SITE_UNKNOWN = REASONS.index("site unknown")
 _HOLD = 2.0  # s that reports may come late
-_CONDITIONS = 4  # most that a source has
-
-
-class Published(NamedTuple):
-    """What became known with the reports fed."""
-
-    tracks: pa.Table
-    assignments: pa.Table
-    identifications: pa.Table
-    health: dict[str, Any]
+_NOTED = ("time", "source", "file", "record", "local_id", "reason")  # of a report, in the journal
 
 
 class Session:
@@ -169,8 +161,7 @@ class Session:
         Raises:
             DataError: the session has ended, no report can be placed, or the setup is one of another place.
         """
-        if self._ended:
-            raise DataError("the session has ended; open another one.")
+        self._refuse_ended()
         if tracks is not None and len(tracks):
             self._journal.append("foreign", foreign_columns(tracks))
         plots, number = self._entered(reports)
@@ -193,8 +184,7 @@ class Session:
         Raises:
             DataError: none of them is usable, or the session has ended.
         """
-        if self._ended:
-            raise DataError("the session has ended; open another one.")
+        self._refuse_ended()
         if not self._setups:
             self._learn()
         return self.setup
@@ -205,8 +195,7 @@ class Session:
         Raises:
             DataError: nothing could be tracked.
         """
-        if self._ended:
-            raise DataError("the session has ended; open another one.")
+        self._refuse_ended()
         none = Plots.build(0, tuple(self._sources), tuple(self._files), {})
         if self._vetting is not None:
             self._vetting.fits(self._setups[0], none, last=True)
@@ -221,6 +210,10 @@ class Session:
         self._journal.close()
         return result
 
+    def _refuse_ended(self) -> None:
+        if self._ended:
+            raise DataError("the session has ended; open another one.")
+
     def health(self) -> dict[str, Any]:
         """Return what is known of sources and reports."""
         return {
@@ -232,22 +225,10 @@ class Session:
 
     def _entered(self, reports: Plots) -> tuple[Plots, _Index]:
         """Number reports, their sources and files as the session does, and note them."""
-        source = numbered(reports.source, reports.sources, self._sources)
-        file = numbered(reports.file, reports.files, self._files)
-        plots = replace(
-            reports,
-            sources=tuple(self._sources),
-            files=tuple(self._files),
-            source=source.astype(np.int32),
-            file=file.astype(np.int32),
-        )
-        sites = [site_of(self._config.site_for(s.system)) for s in self._sources]
-        placeless = (plots.reason == 0) & ~usable(plots, sites)
-        plots = replace(plots, reason=np.where(placeless, _SITE_UNKNOWN, plots.reason).astype(np.int8))
+        plots = placeable(renumbered(reports, self._sources, self._files), self._config)
         number = self._n + np.arange(len(plots))
         self._n += len(plots)
-        names = ("time", "source", "file", "record", "local_id", "reason")
-        self._journal.append("reports", {name: getattr(plots, name) for name in names})
+        self._journal.append("reports", {name: getattr(plots, name) for name in _NOTED})
         self._news.enter(plots, number)
         return plots, number
 
@@ -305,8 +286,7 @@ class Session:
             stop = int(new[0]) if len(new) else len(plots)
             m = setup.placed(self._of_sources(plots.take(slice(0, stop)), len(setup.sensors)), number[:stop])
             self._journal.append("plots", m.columns())
-            order = np.argsort(number[:stop], kind="stable")
-            local_id = plots.local_id[order[np.searchsorted(number[order], m.plot)]].astype(np.int64)
+            local_id = local_ids(plots, number[:stop], m)
             for own, tracking in self._locals.items():
                 mine = tracking.own(m)
                 self._tell(own, tracking.feed(m), m.take(mine), local_id[mine])
@@ -327,27 +307,15 @@ class Session:
     def _look(self) -> None:
         """Look at several systems; the running picture of them begins when there are two."""
         if self._running and self._live is None and self.setup.order and len(self._locals) > 1:
-            self._live = Live(self.setup, list(self._locals))
-            for own, heard in heard_so_far(self._journal, self.setup):
-                self._live.take(own, heard)
+            self._live = Live(self.setup, list(self._locals), heard_so_far(self._journal, self.setup))
         if self._live is not None:
             self._live.look()
 
     def _tell(self, own: int, fed: Fed, m: Measurements | None = None, local_id: _Index | None = None) -> None:
         """Note what a tracker knows anew, after it was given measurements."""
         if self._live is not None:
-            heard = self._live.nothing if m is None or local_id is None else Heard(m, local_id, fed.rows)
-            self._live.take(own, heard._replace(rows=fed.rows))
-        columns = {name: getattr(fed.rows, name) for name in Rows._fields if name != "moments"}
-        self._journal.append("rows", {**columns, **fed.rows.moments._asdict(), "system": _all(own, fed.rows.time)})
-        self._journal.append("fates", {**fed.fates._asdict(), "system": _all(own, fed.fates.plot)})
-        self._journal.append("confirmed", {"track_id": fed.confirmed, "system": _all(own, fed.confirmed)})
-        for source, (_, history) in enumerate(self._locals[own].drained()):
-            probs = np.zeros((len(history.time), _CONDITIONS))
-            probs[:, : history.probs.shape[1]] = history.probs
-            self._journal.append(
-                "conditions", {"source": _all(source, history.time), "time": history.time, "probs": probs}
-            )
+            self._live.take(own, self._live.heard(fed.rows, m, local_id))
+        note_fed(self._journal, own, fed, self._locals[own].drained())
         self._news.tell(list(self._locals).index(own), fed)
 
     def _published(self) -> Published:
@@ -430,10 +398,6 @@ class Session:
                 session._locals[int(own)] = LocalTracking(session.setup, party)
                 session._locals[int(own)].restore(local)
             if words["looked"] is not None:
-                live = Live(session.setup, list(session._locals))
-                session._live = replayed(live, heard_so_far(session._journal, session.setup), words["looked"])
+                heard = heard_so_far(session._journal, session.setup)
+                session._live = Live(session.setup, list(session._locals), heard, words["looked"])
         return session
-
-
-def _all(value: int, like: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
-    return np.full(len(like), value, np.int32)
