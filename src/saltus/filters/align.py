@@ -262,6 +262,11 @@ def _indefinite(a: _Array, scale: _Array) -> npt.NDArray[np.bool_]:
     """Which matrices are no covariances, by their pivots in units of the variances."""
     unit = np.divide(a, scale, out=np.zeros_like(a), where=scale > 0)
     bad = np.asarray(((a != 0) & (scale == 0)).any(axis=(-1, -2)))
+    try:  # mostly all are definite, which costs least to find
+        np.linalg.cholesky(unit + _INDEFINITE * np.eye(a.shape[-1]))
+        return bad
+    except np.linalg.LinAlgError:
+        pass
     for j in range(a.shape[-1]):
         pivot, rest = unit[..., j, j], unit[..., j + 1 :, j]
         bad |= pivot < -_INDEFINITE

@@ -14,7 +14,7 @@ import numpy as np
 from saltus.errors import DataError, ModelError
 from saltus.identify.lanes import Index, flatten
 from saltus.identify.local import LocalTracks, PairSettings, spans
-from saltus.identify.pairs import Ratios, candidate_pairs, pair_ratios
+from saltus.identify.pairs import Ratios, candidate_pairs, pair_ratios, ratios_under
 from saltus.models.checks import FloatArray
 from saltus.shapes import Float, Int
 
@@ -65,8 +65,7 @@ def latest_ratios(
         pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     total, time = np.full(len(pairs), -np.inf), np.full(len(pairs), -np.inf)
     last = np.zeros(len(pairs), np.int64)
-    for component, weight in zip(settings, weights, strict=True):
-        ratios = pair_ratios(a, b, pairs, component)
+    for ratios, weight in zip(ratios_under(a, b, pairs, settings), weights, strict=True):
         last = ratios.count - 1
         if not (len(pairs) and last.max() >= 0):
             return pairs[:0], time[:0], total[:0]

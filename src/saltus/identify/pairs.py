@@ -6,6 +6,7 @@ filter for each pair, which starts from the own belief of the track that was the
 Source: Chervakov, Bogdanov and Zhironkin (2016), section on two systems, with a multimode filter for each hypothesis.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -28,7 +29,7 @@ from saltus.identify.local import LocalTracks, PairSettings, Spans, spans
 from saltus.models.checks import FloatArray
 from saltus.shapes import Float, Int
 
-__all__ = ["LocalTracks", "PairSettings", "Ratios", "candidate_pairs", "pair_ratios"]
+__all__ = ["LocalTracks", "PairSettings", "Ratios", "candidate_pairs", "pair_ratios", "ratios_under"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,28 +86,56 @@ def pair_ratios(
         DataError: local tracks that are none, or pairs that name no track.
         NumericalError: a measurement without noise.
     """
+    (found,) = ratios_under(a, b, pairs, [settings])
+    if log_prior_identity is not None:
+        found.llr[:] += np.broadcast_to(np.asarray(log_prior_identity, dtype=np.float64), len(found.count))[:, None]
+    return found
+
+
+def ratios_under(
+    a: LocalTracks, b: LocalTracks, pairs: npt.ArrayLike, settings: Sequence[PairSettings]
+) -> list[Ratios]:
+    """Return the ratios of `pair_ratios` under several offsets of the same objects: what these do alone is one work.
+
+    Args:
+        a: tracks of one system.
+        b: of the other, or a.
+        pairs: (P, 2).
+        settings: which differ in `offset_cov` and `offset_time` alone.
+    """
     spans_a, spans_b = spans(a, "a"), spans(b, "b")
     chosen = _pairs(pairs, len(spans_a.first), len(spans_b.first))
     rows = _common(a, b, spans_a, spans_b, chosen)
     own_a, own_b = (
-        _own(tracks, span, settings, earlier)
+        _own(tracks, span, settings[0], earlier)
         for tracks, span, earlier in ((a, spans_a, rows.earlier[0]), (b, spans_b, rows.earlier[1]))
     )
     both = LocalTracks(*(np.concatenate(part) for part in zip(a, b, strict=True)))
     alone, velocity, spread = (np.concatenate(part) for part in zip(own_a[:3], own_b[:3], strict=True))
+    return [_under(a, both, rows, (own_a, own_b), alone, velocity, spread, offset) for offset in settings]
+
+
+def _under(
+    a: LocalTracks,
+    both: LocalTracks,
+    rows: _Rows,
+    own: tuple[_Own, _Own],
+    alone: FloatArray,
+    velocity: FloatArray,
+    spread: FloatArray,
+    settings: PairSettings,
+) -> Ratios:
     count = rows.length[0] + rows.length[1]
-    time, llr = np.full((2, len(chosen), int(count.max(initial=0))), np.nan)
+    time, llr = np.full((2, len(count), int(count.max(initial=0))), np.nan)
     for lanes in batches(count, 4 + len(settings.differences()), _modes(settings)):
         at, row, late = _merged(both, rows, lanes, len(a.time))
         merged = _filled(count[lanes], at, both, row)
         merged = _with_differences(merged, at, late, velocity[row], spread[row], settings)
-        start = _started(merged.time[:, 0], lanes, rows, (own_a.start, own_b.start), settings)
+        start = _started(merged.time[:, 0], lanes, rows, (own[0].start, own[1].start), settings)
         step = joint_log_likelihood(merged, start, settings)
         step[at] -= alone[row]
         place = (lanes[at[0]], at[1])
         time[place], llr[place] = both.time[row], np.cumsum(step, axis=1)[at]
-    if log_prior_identity is not None:
-        llr += np.broadcast_to(np.asarray(log_prior_identity, dtype=np.float64), len(chosen))[:, None]
     return Ratios(time, llr, count)
 
 
