@@ -27,7 +27,7 @@ from saltus.engine.stretch import Stretch
 from saltus.engine.vetting import Vetting
 from saltus.errors import DataError
 from saltus.progress import Progress
-from saltus.records import REASONS, Plots, Source
+from saltus.records import Plots, Source
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.rows import Fed
 
@@ -35,7 +35,6 @@ __all__ = ["Published", "Session"]
 
 _Index = npt.NDArray[np.int64]
 
-_SITE_UNKNOWN = REASONS.index("site unknown")
 _HOLD = 2.0  # s that reports may come late
 _NOTED = ("time", "source", "file", "record", "local_id", "reason")  # of a report, in the journal
 
