@@ -45,9 +45,8 @@ def found(series, *, episodes=(), conflicts=(), names=("A", "B"), local=("1", ""
     ends = np.array([(a, b) for a, b, _, _ in series], int).reshape(-1, 2)
     e = [np.array(x) for x in zip(*episodes, strict=True)] or [np.zeros(0, int)] * 2 + [np.zeros(0)] * 3
     e[2:4] = [T0 + x for x in e[2:4]]
-    s = Segments(
-        np.arange(4), T0 + np.zeros(4), T0 + np.full(4, 150.0), np.array([7, 9, 7, 11]), np.array([1.0, 1.0, 0.8, 1.0])
-    )
+    start, end = T0 + np.zeros(4), T0 + np.full(4, 150.0)
+    s = Segments(np.arange(4), start, end, np.array([7, 9, 7, 11]), np.array([1.0, 1.0, 0.8, 1.0]), time_known=start)
     return SystemsFound(
         names=names,
         titles=names,
@@ -55,7 +54,7 @@ def found(series, *, episodes=(), conflicts=(), names=("A", "B"), local=("1", ""
         local_id=local,
         address=np.array([-1, 0x4B1617, 0x3C0001, -1]),
         segments=s,
-        decisions=Decisions(Episodes(*e), tuple(conflicts)),
+        decisions=Decisions(Episodes(*e, since=np.full(len(e[0]), -np.inf), until=e[3]), tuple(conflicts)),
         evidence=Evidence(ends, pair, time, llr),
         rule=RULE,
         biases=biases or {"reference": "A", "systems": {}},
