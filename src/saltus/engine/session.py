@@ -171,10 +171,7 @@ class Session:
         return self._published()
 
     def tell_periods(self, periods: Mapping[str, float]) -> None:
-        """Say the update period of each source that its reader tells by now, by designation, s.
-
-        It counts for what is learnt from then on: a first stretch that has not ended, sources that appear later.
-        """
+        """Say the update period of each source that its reader tells by now, by designation, s: for what is learnt yet."""
         self._periods |= periods
 
     def settle(self) -> Setup:
