@@ -171,7 +171,7 @@ class Session:
         return self._published()
 
     def tell_periods(self, periods: Mapping[str, float]) -> None:
-        """Say the update period of each source that its reader tells by now, by designation, s: for what is learnt yet."""
+        """Say the update periods, s, that readers tell of sources by now, by designation, for what is yet learnt."""
         self._periods |= periods
 
     def settle(self) -> Setup:
