@@ -231,6 +231,7 @@ def test_a_signal_ends_the_program_and_leaves_nothing(recording, tmp_path, numbe
     path, config = recording
     code = (
         "import os, signal, saltus.run.command as command\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # jobs in the background begin without
         f"command.follow = lambda *_, **__: os.kill(os.getpid(), {int(number)})\n"
         "from saltus.cli import main; main()"
     )
