@@ -11,8 +11,8 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from saltus.engine.identified import Identified
-from saltus.identify import Conflict, Decisions, DecisionSettings, Episodes, Evidence, LocalTracks, join_evidence
+from saltus.engine.identified import Identified, SystemNames
+from saltus.identify import Conflict, Decisions, DecisionSettings, Episodes, Evidence, join_evidence
 from saltus.records import Plots, Source, System
 from saltus.report import pairs
 from saltus.report.pairs import pair_rows, step_path, thinned_series, undecided
@@ -20,8 +20,6 @@ from saltus.report.section import systems_section
 from saltus.report.systems import MAX_CONFLICTS, SystemsFound, bias_blocks, conflict_rows, system_rows
 from saltus.run import track_files
 from saltus.run.identified import systems_found
-from saltus.tracks.encounters import SystemTracks
-from saltus.tracks.local import LocalSystem
 from saltus.tracks.membership import Segments
 from saltus.tracks.settings import SystemsSettings
 from saltus.tracks.systems import Registered
@@ -182,12 +180,8 @@ def test_configured_names_are_what_people_read(tmp_path):
 
 
 def one_track(name, own):
-    """A system with one track of two rows, measurements or another centre's."""
-    rows = LocalTracks(np.zeros(2, int), T0 + np.arange(2.0), np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1)))
-    view = SystemTracks(rows, np.zeros((2, 2)), np.full((2, 2), np.nan), np.array([-1]))
-    measurement = np.arange(2) if own else np.full(2, -1)
-    known, codes = rows.time, np.full((2, 2), -1)
-    return LocalSystem(name, view, np.array([-1]), ("",), known[:1], np.array([1]), measurement, 10.0, known, codes)
+    """A system with one track, of measurements or another centre's."""
+    return SystemNames(name, own, np.array([1]), ("",), np.array([-1]), np.array([T0 + 1.0]))
 
 
 def test_objects_of_other_centres_alone_are_not_counted():
@@ -197,8 +191,8 @@ def test_objects_of_other_centres_alone_are_not_counted():
     lives = Segments(np.arange(3), begin, begin + 1.0, np.array([1, 2, 2]), np.ones(3), begin)
     nobody = Episodes(*[np.zeros(0, int)] * 2, *[np.zeros(0)] * 5)
     how = [Registered(s.name, "", None) for s in systems]
-    whole = Identified(systems, how, lives, (), (), Decisions(nobody, ()), join_evidence([]))
-    single = Identified(systems[:1], how[:1], lives, (), (), whole.decisions, whole.evidence)
+    whole = Identified(systems, how, lives, (), (), Decisions(nobody, ()), join_evidence([]), {})
+    single = Identified(systems[:1], how[:1], lives, (), (), whole.decisions, whole.evidence, {})
     rows = system_rows(systems_found(whole, SystemsSettings(), {"radar": "R"}))
     assert [r.common for r in rows] == [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
     assert [r.identified for r in rows] == [0, 0, 0]

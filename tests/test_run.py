@@ -454,7 +454,7 @@ def leftovers(folder):
 
 @pytest.mark.parametrize(
     "where",
-    ["saltus.engine.setup.place_plots", "saltus.engine.result.assignment_table", "saltus.io.write.json.dumps"],
+    ["saltus.engine.setup.place_plots", "saltus.engine.outcome.assignment_table", "saltus.io.write.json.dumps"],
 )
 @pytest.mark.parametrize("older", [False, True])
 def test_ctrl_c_leaves_nothing_half_written(tmp_path, monkeypatch, where, older):

@@ -6,16 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.compute as pc
 
 from saltus.engine import Result
 from saltus.engine.learn import sigmas
 from saltus.text import say, shown
-from saltus.tracks.health import Health, nis_interval, sensor_health
+from saltus.tracks.health import degraded_intervals, nis_interval
 from saltus.tracks.noise import LEAST
-from saltus.tracks.rows import join_rows
 
-__all__ = ["health_of", "noise_rows", "show_summary", "summarise", "why_no_track"]
+__all__ = ["noise_rows", "show_summary", "summarise", "why_no_track"]
 
 _DOUBTFUL_NIS = 3.0  # of two degrees of freedom
 _TOO_SMALL_NIS = 0.3
@@ -38,54 +36,47 @@ def summarise(inputs: Sequence[Path], result: Result, problems: Sequence[str]) -
         result: of the run; where states are of several systems, what may last between those widens their innovations.
         problems: lines for the user.
     """
-    tracked, tracks, assigned = result.tracked, result.tracks, result.assignments
-    used = int(pc.sum(pc.is_valid(assigned["track_id"])).as_py() or 0)
-    reasons = pc.value_counts(assigned["reason"].drop_null()).to_pylist()
-    status = np.array(tracks["status"])
-    ids = tracked.assignments.track_id
+    became, figures, (first, last) = result.outcome, result.figures, result.span
+    read, hours = len(result.reason), (last - first) / 3600.0
     noise = _noise_table(result)
-    hours = float(np.ptp(tracked.measurements.time)) / 3600.0
     return {
         "version": version("saltus"),
         "inputs": [shown(Path(p).name) for p in inputs],
         "plane": _plane(result),
-        "time_from": float(tracked.measurements.time[0]),
-        "time_to": float(tracked.measurements.time[-1]),
-        "reports": {"read": len(assigned), "used": used, "unused": len(assigned) - used},
-        "reasons": {r["values"]: r["counts"] for r in sorted(reasons, key=lambda r: -r["counts"])},
+        "time_from": first,
+        "time_to": last,
+        "reports": {"read": read, "used": became.used, "unused": read - became.used},
+        "reasons": dict(sorted(became.reasons.items(), key=lambda row: -row[1])),
         "tracks": {
-            "confirmed": len(tracked.assignments.confirmed),
-            "confirmed_per_hour": round(len(tracked.assignments.confirmed) / hours, 1) if hours > 0 else None,
-            "never_confirmed": len(np.setdiff1d(ids[ids > 0], tracked.assignments.confirmed)),
-            "updates": int((status != "coasted").sum()),
-            "coasted": int((status == "coasted").sum()),
+            "confirmed": became.confirmed,
+            "confirmed_per_hour": round(became.confirmed / hours, 1) if hours > 0 else None,
+            "never_confirmed": became.never_confirmed,
+            "updates": figures.updates,
+            "coasted": figures.coasted,
         },
         "noise": noise,
-        "faults": _fault_table(health_of(result)),
+        "faults": _fault_table(result),
         "problems": [*problems, *_doubts(noise, several=len(result.whole.systems) > 1)],
     }
 
 
 def why_no_track(result: Result) -> str:
     """Say in one line why no track was confirmed: few reports, a short time, none near, or too few in a row."""
-    m, settings = result.tracked.measurements, result.setup.config.tracker
-    hits, scans, sensors = settings.confirm_hits, settings.confirm_scans, result.setup.sensors
-    placed = np.isfinite(m.position[:, 0]) & np.isnan(m.bearing)
-    reports = result.tracked.assignments.track_id[placed]
-    reports = np.bincount(reports[reports > 0], minlength=1)
-    period = min(sensors[s].period for s in np.unique(m.source[placed])) if placed.any() else np.inf
-    said, span = f"no track: none got {hits} reports in {scans} update periods", float(np.ptp(m.time))
+    settings, sensors, became = result.setup.config.tracker, result.setup.sensors, result.outcome
+    hits, scans, placed = settings.confirm_hits, settings.confirm_scans, int(became.placed.sum())
+    period = min((sensors[s].period for s in np.flatnonzero(became.placed)), default=np.inf)
+    said, span = f"no track: none got {hits} reports in {scans} update periods", result.span[1] - result.span[0]
     ask = "is the update period another (period in its [[sensor]] table), or a unit wrong (NM for m, feet for m)?"
-    if placed.sum() < hits:
-        return f"{said}; {placed.sum()} reports with a position can be tracked."
+    if placed < hits:
+        return f"{said}; {placed} reports with a position can be tracked."
     if span < (hits - 1) * period:
         return f"{said} of {period:.3g} s; the reports last {span:.3g} s. Track a longer time; {ask}"
-    if reports.max() < 2:
+    if became.longest < 2:
         return (
             f"{said} of {period:.3g} s; no report has another near it within that time, at up to "
             f"{settings.max_speed:g} m/s (max_speed): {ask}"
         )
-    return f"{said} of {period:.3g} s; the longest of {np.sum(reports > 1)} begun got {reports.max()}: {ask}"
+    return f"{said} of {period:.3g} s; the longest of {became.begun} begun got {became.longest}: {ask}"
 
 
 def _plane(result: Result) -> dict[str, object]:
@@ -100,10 +91,9 @@ def _plane(result: Result) -> dict[str, object]:
 
 def _noise_table(result: Result) -> dict[str, object]:
     """State for each source what was configured, estimated and used, and whether the innovations agree."""
-    rows = join_rows(result.tracked.rows)
     table: dict[str, object] = {}
     for s, sensor in enumerate(result.setup.sensors):
-        d2 = rows.d2[(rows.source == s) & np.isfinite(rows.d2)]
+        n, total = int(result.figures.nis_updates[s]), float(result.figures.nis[s])
         row: dict[str, object] = {"system": str(sensor.source.system)}
         for label, field, scale in sigmas(sensor):
             row[label] = {
@@ -112,30 +102,21 @@ def _noise_table(result: Result) -> dict[str, object]:
                 "used": _rounded(getattr(sensor.noise, field) * scale),
             }
         row["update_period_s"] = _rounded(sensor.period)
-        row["nis_mean"] = _rounded(float(d2.mean()) if len(d2) else np.nan)
+        row["nis_mean"] = _rounded(total / n if n else np.nan)
         row["nis_expected"] = 2.0
-        row["nis_interval"] = [_rounded(edge) for edge in nis_interval(len(d2))]
-        row["nis_updates"] = len(d2)
+        row["nis_interval"] = [_rounded(edge) for edge in nis_interval(n)]
+        row["nis_updates"] = n
         table[sensor.name if sensor.name not in table else f"{sensor.name} ({sensor.source.system})"] = row
     return table
 
 
-def health_of(result: Result) -> list[Health]:
-    """Gather the faults that the tracker found, by source."""
-    m, found = result.tracked.measurements, result.tracked.assignments
-    rows = join_rows(result.tracked.rows)
-    at = np.flatnonzero((rows.measurement >= 0) & np.isin(rows.track_id, found.confirmed))
-    plot = rows.measurement[at]
-    names = [sensor.name for sensor in result.setup.sensors]
-    return sensor_health(names, found.sources, m.source[plot], m.time[plot], rows.p_fault[at], rows.fault[at])
-
-
-def _fault_table(sensors: Sequence[Health]) -> dict[str, object]:
+def _fault_table(result: Result) -> dict[str, object]:
     """State for each source how many of its plots were faulty, and when it was degraded."""
     table: dict[str, object] = {}
-    for s, sensor in enumerate(sensors):
-        n = len(sensor.time)
-        counts = {name: int((sensor.fault == 1 + c).sum()) for c, name in enumerate(sensor.components)}
+    for s, (sensor, condition) in enumerate(zip(result.setup.sensors, result.conditions, strict=True)):
+        law, faults = condition.law, result.figures.faults[s]
+        n = int(faults.sum())
+        counts = {name: int(faults[1 + c]) for c, name in enumerate(law.components)}
         table[sensor.name if sensor.name not in table else f"{sensor.name} ({s})"] = {
             "judged_plots": n,
             "flagged_plots": sum(counts.values()),
@@ -148,7 +129,7 @@ def _fault_table(sensors: Sequence[Health]) -> dict[str, object]:
                     "condition": d.condition,
                     "probability": _rounded(d.probability),
                 }
-                for d in sensor.intervals
+                for d in degraded_intervals(condition.history, law)
             ],
         }
     return table

@@ -13,7 +13,7 @@ from saltus.geo import Plane
 from saltus.records import Kind
 from saltus.simulate import Leg, Radar, Trajectory, observe
 from saltus.tracks.faults import History, SourceCondition, plot_law, weighty
-from saltus.tracks.health import degraded_intervals, sensor_health
+from saltus.tracks.health import degraded_intervals, flagged, sensor_health
 from saltus.tracks.rows import ConditionFound
 from saltus.tracks.settings import TrackerSettings
 
@@ -374,10 +374,9 @@ def test_health_counts_by_source_and_component():
     found = sensor_health(
         ["radar", "ads-b"],
         sources,
-        np.array([0, 1, 0, 0, 1, 0], np.int32),
-        np.array([3.0, 1.0, 2.0, 5.0, 4.0, 6.0]),
-        np.array([0.9, 0.9, 0.1, 0.6, 0.4, np.nan]),
-        np.array([1, 1, 2, 2, 1, 0], np.int8),
+        np.array([0, 1, 0, 0, 1], np.int32),
+        np.array([3.0, 1.0, 2.0, 5.0, 4.0]),
+        flagged(np.array([0.9, 0.9, 0.1, 0.6, 0.4]), np.array([1, 1, 2, 2, 1], np.int8)),
     )
     assert [h.name for h in found] == ["radar", "ads-b"]
     assert found[0].time.tolist() == [2.0, 3.0, 5.0] and found[0].fault.tolist() == [0, 1, 2]

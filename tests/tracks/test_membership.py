@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from saltus.tracks.membership import Local, Membership, Merger, known_since
+from saltus.tracks.membership import KnownSince, Local, Membership, Merger
 
 DEATH, PART, BIRTH, JOIN = range(4)  # the order of what becomes known at one time
 
@@ -52,8 +52,9 @@ def test_a_decision_holds_backwards_and_tells_when_it_was_made():
     got, membership, _ = cut([0, 10], [100, 90], (0, 1, 40, 90, 0.97))
     assert got == {0: [(0, 100, 1, 1.0, 3)], 1: [(10, 90, 1, 0.97, 40)]}
     assert membership.mergers == [Merger(1, 2, 1, 10.0, 40.0)]
-    rows = known_since(membership.changes, np.array([1, 1, 1, 2]), np.array([5.0, 10.0, 60.0, 60.0]))
-    assert rows.tolist() == [3.0, 40.0, 40.0, 40.0]
+    rows = KnownSince(membership.changes).at(np.array([1, 1, 1, 2, 9]), np.array([5.0, 10.0, 60.0, 60.0, 60.0]))
+    assert rows.tolist() == [3.0, 40.0, 40.0, 40.0, -np.inf]
+    assert KnownSince([]).at(np.array([1]), np.array([5.0])).tolist() == [-np.inf]
 
 
 def test_it_holds_no_further_back_than_the_evidence():

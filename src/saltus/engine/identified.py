@@ -8,27 +8,32 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from saltus.engine.distances import Distances
+from saltus.engine.journal import Journal
+from saltus.engine.replay import replayed
 from saltus.engine.setup import Setup
+from saltus.engine.tally import PartyTally, Tally
 from saltus.errors import ModelError
-from saltus.identify import Decisions, Episodes, Evidence, join_evidence
+from saltus.identify import Decisions, Episodes, Evidence, LocalTracks, join_evidence
 from saltus.records import Plots
 from saltus.tracks.bias import PARAMETERS
 from saltus.tracks.local import LocalSystem, Party, foreign_systems, local_system
-from saltus.tracks.membership import Change, Merger, Segments, known_since
+from saltus.tracks.membership import Change, Merger, Segments
 from saltus.tracks.picture import Picture
 from saltus.tracks.rows import Tracked, join_rows
-from saltus.tracks.system_tracks import Part, track_systems
 from saltus.tracks.systems import Registered, order_of_trust
+from saltus.tracks.window import Window
 
 __all__ = [
     "IDENTIFICATIONS",
     "Identified",
+    "SystemNames",
     "bias_tables",
     "identification_table",
+    "identify",
     "local_systems",
     "published_tracks",
     "refuse_reference",
-    "together",
     "trusted",
 ]
 
@@ -48,39 +53,108 @@ IDENTIFICATIONS = pa.schema(
 )
 
 
+class SystemNames(NamedTuple):
+    """A system's confirmed local tracks; arrays are (K,)."""
+
+    name: str
+    own: bool  # whether there are measurements, and not another centre's tracks alone
+    ids: npt.NDArray[np.int64]  # the local tracker's number of each
+    local_id: tuple[str, ...]  # the system's own number or address of each, "" none
+    address: npt.NDArray[np.int64]  # -1 none
+    end: npt.NDArray[np.float64]  # last report of each, s
+
+
 @dataclass(frozen=True, slots=True)
 class Identified:
     """Who is whom in a run; local tracks are numbered through all systems in their order."""
 
-    systems: list[LocalSystem]
+    systems: list[SystemNames]
     registered: list[Registered]
     segments: Segments  # system tracks are numbered as in the published rows
     mergers: Sequence[Merger]  # numbers of the running picture that are not used any more
     changes: Sequence[Change]
     decisions: Decisions
     evidence: Evidence
+    apart: Mapping[tuple[int, int, int], float]  # m between two systems' positions of one address: median
 
 
-def together(
-    setup: Setup, tracked: Mapping[Party, Tracked], plots: Plots, foreign: pa.Table | None
-) -> tuple[Identified, Tracked]:
-    """Put what the trackers of all systems found together.
-
-    One system is its tracker alone. Several are put into one frame, told apart or found to be one, and published as
-    system tracks.
+def identify(journal: Journal, setup: Setup, told: Tally) -> Identified:
+    """Find out who is whom among several systems: each look sees what was known by then; one system is itself.
 
     Args:
+        journal: of a session that has ended.
         setup: of all sources.
-        tracked: what each system's tracker found.
-        plots: all reports; `Measurements.plot` are places in it.
-        foreign: another centre's tracks, never part of a state.
+        told: of the journal.
     """
-    local = local_systems(setup, tracked, plots, foreign)
-    refuse_reference(setup, [system.name for system in local])
-    if len(local) == 1:
-        return _single(local[0]), next(iter(tracked.values()))
-    whole = _identified(local, list(tracked), setup)
-    return whole, _joined(tracked, whole, setup)
+    foreign = journal.all("foreign")
+    centres = [] if foreign is None else _foreign(pa.table(foreign), setup, told.span)
+    names = [party_names(p, setup) for p in told.parties] + [_centre_names(x) for x in centres]
+    refuse_reference(setup, [x.name for x in names])
+    if len(names) == 1:
+        return _single(names[0], told.parties[0])
+    windows = [Window(p.party.name, p.ids, p.ready, use_identity=setup.use_identity) for p in told.parties]
+    picture, distances = _picture(names, [p.party for p in told.parties], setup), Distances([x.address for x in names])
+    looks = _Looks(picture, windows, centres, setup.config.systems.every)
+    for stretch in replayed(journal, told, states=False):
+        for window, reported in zip(windows, stretch.systems, strict=True):
+            window.take(reported)
+        distances.add([*(w.latest for w in windows), *(_rows_until(x, stretch.until) for x in centres)])
+        looks.until(stretch.until)
+    looks.end()
+    return _found(names, picture, distances.medians())
+
+
+def party_names(told: PartyTally, setup: Setup) -> SystemNames:
+    """Return what the local tracks of a system with measurements are called."""
+    hidden = np.full(len(told.ids), -1)
+    label = tuple(
+        f"{c:06X}" if c >= 0 else str(n) if n >= 0 else ""
+        for c, n in zip(told.names.icao24.tolist(), told.names.local_id.tolist(), strict=True)
+    )
+    address = told.names.icao24 if setup.use_identity else hidden
+    return SystemNames(told.party.name, True, told.ids, label, address, told.end)
+
+
+def _centre_names(x: LocalSystem) -> SystemNames:
+    tracks = x.view.tracks
+    last = np.append(np.flatnonzero(np.diff(tracks.track)), len(tracks.track) - 1)
+    return SystemNames(x.name, x.own, x.ids, x.local_id, x.view.icao24, tracks.time[last])
+
+
+class _Looks:
+    """Looks at several systems, every so many seconds, from the first report known to the last."""
+
+    def __init__(self, picture: Picture, windows: Sequence[Window], centres: Sequence[LocalSystem], every: float):
+        self._picture, self._windows, self._centres, self._every = picture, windows, centres, every
+        known = [x.known for x in centres if len(x.known)]
+        self._first = min((float(k.min()) for k in known), default=np.inf)
+        self._last = max((float(k.max()) for k in known), default=-np.inf)
+        self._next: float | None = None
+        self._before = -np.inf  # s: of the last look
+
+    def until(self, time: float) -> None:
+        """Do those for which everything is known, where nothing to come is earlier than a time, s."""
+        spans = [window.known for window in self._windows]
+        first = min(self._first, *(span[0] for span in spans))
+        last = max(self._last, *(span[1] for span in spans))
+        if self._next is None:
+            if first > time or not np.isfinite(first):
+                return
+            self._next = float(np.floor(first / self._every)) + 1.0
+        while (self._next * self._every < time) and self._next <= np.floor(last / self._every):
+            now, since = self._next * self._every, self._next * self._every - self._picture.kept
+            self._picture.look(now, self._systems(now, since))
+            for window in self._windows:
+                window.forget(since, now)
+            self._before, self._next = now, self._next + 1.0
+
+    def end(self) -> None:
+        """Do the rest, and number the tracks confirmed since the last one."""
+        self.until(np.inf)
+        self._picture.close(self._systems(np.inf, np.inf))
+
+    def _systems(self, now: float, since: float) -> list[LocalSystem]:
+        return [*(window.system(now, since, self._before) for window in self._windows), *self._centres]
 
 
 def local_systems(
@@ -98,39 +172,36 @@ def local_systems(
         )
         for party, t in tracked.items()
     ]
-    return local + (_foreign(foreign, setup, plots) if foreign is not None and len(foreign) else [])
+    if foreign is None or not len(foreign):
+        return local
+    usable = plots.time[plots.reason == 0]
+    return local + _foreign(foreign, setup, (float(usable.min()), float(usable.max())))
 
 
-def _foreign(tracks: pa.Table, setup: Setup, plots: Plots) -> list[LocalSystem]:
+def _foreign(tracks: pa.Table, setup: Setup, span: tuple[float, float]) -> list[LocalSystem]:
     """Another centre's tracks within the time of the reports."""
     time = tracks["time"].to_numpy(zero_copy_only=False)
-    usable = plots.time[plots.reason == 0]
-    inside = (time >= usable.min()) & (time <= usable.max())
+    inside = (time >= span[0]) & (time <= span[1])
     found = foreign_systems(
         tracks.filter(pa.array(inside)), setup.plane, setup.config.systems.track_sigma, use_identity=setup.use_identity
     )
     return [system for system in found if len(system.ids)]
 
 
-def _single(system: LocalSystem) -> Identified:
+def _rows_until(x: LocalSystem, time: float) -> LocalTracks:
+    """Return the rows of a centre's tracks up to a time."""
+    keep = x.view.tracks.time <= time
+    return LocalTracks(*(column[keep] for column in x.view.tracks))
+
+
+def _single(names: SystemNames, told: PartyTally) -> Identified:
     """One system: every local track is a system track with the tracker's number."""
-    tracks = system.view.tracks
-    first = np.flatnonzero(np.diff(tracks.track, prepend=-1))
-    last = np.append(first[1:], len(tracks.time)) - 1
-    known = tracks.track[first] if len(first) else np.zeros(0, np.int64)
-    ids = system.ids[known]
-    lives = Segments(
-        known,
-        tracks.time[first],
-        tracks.time[last] if len(first) else np.zeros(0),
-        ids,
-        np.ones(len(ids)),
-        system.ready[known],
-    )
+    ids = told.ids
+    lives = Segments(np.arange(len(ids)), told.begin, told.end, ids, np.ones(len(ids)), told.ready)
     none = np.zeros(0)
     nobody = Episodes(none.astype(np.int64), none.astype(np.int64), none, none, none, none, none)
-    alone = [Registered(system.name, "", None)]
-    return Identified([system], alone, lives, (), (), Decisions(nobody, ()), join_evidence([]))
+    alone = [Registered(names.name, "", None)]
+    return Identified([names], alone, lives, (), (), Decisions(nobody, ()), join_evidence([]), {})
 
 
 def refuse_reference(setup: Setup, systems: Sequence[str]) -> None:
@@ -154,34 +225,26 @@ def trusted(setup: Setup, systems: Sequence[LocalSystem]) -> tuple[str, ...]:
     return tuple(names[k] for k in order)
 
 
-def _identified(local: Sequence[LocalSystem], parties: Sequence[Party], setup: Setup) -> Identified:
-    config, names = setup.config, [system.name for system in local]
+def _picture(systems: Sequence[SystemNames], parties: Sequence[Party], setup: Setup) -> Picture:
+    config, names = setup.config, [system.name for system in systems]
     order = sorted(range(len(names)), key=lambda k: setup.order.index(names[k]) if names[k] in setup.order else np.inf)
     periods = [min(setup.sensors[s].period for s in p.sources if setup.sensors[s].heard) for p in parties]
-    periods += [config.systems.track_memory] * (len(local) - len(parties))
-    picture = Picture(names, order, periods, config.systems, config.registration, config.filter)
-    every = config.systems.every
-    times = [system.known for system in local if len(system.known)]
-    if times:
-        first, last = (np.floor(f(f(t) for t in times) / every) for f in (min, max))
-        for k in np.arange(first + 1.0, last + 1.0).tolist():
-            picture.look(k * every, local)
-    picture.close(local)
-    return _found(local, picture)
+    periods += [config.systems.track_memory] * (len(names) - len(parties))
+    return Picture(names, order, periods, config.systems, config.registration, config.filter)
 
 
-def _found(local: Sequence[LocalSystem], picture: Picture) -> Identified:
+def _found(systems: list[SystemNames], picture: Picture, apart: Mapping[tuple[int, int, int], float]) -> Identified:
     """Return what a picture found, with local tracks numbered through all systems in their order."""
-    first = np.cumsum([0, *(len(system.ids) for system in local)])
-    place = {(k, own): first[k] + at for k, s in enumerate(local) for at, own in enumerate(s.ids.tolist())}
+    first = np.cumsum([0, *(len(system.ids) for system in systems)])
+    place = {(k, own): first[k] + at for k, s in enumerate(systems) for at, own in enumerate(s.ids.tolist())}
     number = np.array([place[key] for key in picture.number], np.int64)
-    end = np.array([s.view.tracks.time[s.view.tracks.track == at].max() for s in local for at in range(len(s.ids))])
+    end = np.concatenate([system.end for system in systems])
     members, decisions, evidence = picture.membership, picture.decisions(), picture.evidence()
     lives = members.segments(end[number])
     order = np.lexsort((lives.time_from, number[lives.track])) if len(lives.track) else np.zeros(0, np.int64)
     e = decisions.episodes
     return Identified(
-        list(local),
+        systems,
         picture.registered(),
         Segments(*(column[order] for column in lives._replace(track=number[lives.track]))),
         [m._replace(track=int(number[m.track])) for m in members.mergers],
@@ -191,19 +254,8 @@ def _found(local: Sequence[LocalSystem], picture: Picture) -> Identified:
             tuple(c._replace(a=int(number[c.a]), b=int(number[c.b])) for c in decisions.conflicts),
         ),
         evidence._replace(pairs=number[evidence.pairs]),
+        apart,
     )
-
-
-def _joined(tracked: Mapping[Party, Tracked], whole: Identified, setup: Setup) -> Tracked:
-    parts = [
-        Part(system, how, t.measurements, t.assignments, join_rows(t.rows), np.array(party.sources))
-        for system, how, (party, t) in zip(whole.systems, whole.registered, tracked.items(), strict=False)
-    ]
-    waits, config = [s.wait for s in setup.sensors], setup.config
-    found = track_systems(parts, whole.segments, config.filter, config.tracker, waits, use_identity=setup.use_identity)
-    rows = found.rows
-    known = np.maximum(rows.time_known, known_since(whole.changes, rows.track_id, rows.time))
-    return Tracked([rows._replace(time_known=known)], found.measurements, found.assignments)
 
 
 class _Stretches(NamedTuple):

@@ -21,7 +21,7 @@ import shutil
 import tempfile
 import weakref
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -65,13 +65,19 @@ class Journal:
         if self._count[kind] >= _ROWS:
             self._seal(kind)
 
-    def parts(self, kind: str) -> Iterator[dict[str, _Array]]:
-        """Yield all rows of a kind, segment by segment."""
+    def parts(self, kind: str, columns: Sequence[str] | None = None) -> Iterator[dict[str, _Array]]:
+        """Yield all rows of a kind, segment by segment; `columns` names those wanted, None: all."""
         for k in range(len(self._sealed.get(kind, ()))):
             with pa.memory_map(str(self._path(kind, k))) as source:
-                yield from_table(pa.ipc.open_file(source).read_all())
+                table = pa.ipc.open_file(source).read_all()
+                yield from_table(table if columns is None else table.select(list(columns)))
         if self._count.get(kind):
-            yield joined(self._waiting[kind])
+            waiting = self._waiting[kind]
+            yield joined(waiting if columns is None else [{name: part[name] for name in columns} for part in waiting])
+
+    def count(self, kind: str) -> int:
+        """Return the number of rows of a kind."""
+        return len(self._sealed.get(kind, ())) * _ROWS + self._count.get(kind, 0)
 
     def all(self, kind: str) -> dict[str, _Array] | None:
         """Return all rows of a kind at once, None without any."""

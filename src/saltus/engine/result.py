@@ -8,37 +8,43 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from saltus.engine.figures import Figures, RunFigures
 from saltus.engine.identified import (
     Identified,
     bias_tables,
     identification_table,
+    identify,
     local_systems,
     refuse_reference,
-    together,
     trusted,
 )
 from saltus.engine.journal import Journal
 from saltus.engine.live import Heard
+from saltus.engine.outcome import Outcome, outcome
+from saltus.engine.replay import rows_of
 from saltus.engine.setup import Setup
+from saltus.engine.spool import InOrder, Place, Spool, Stored
+from saltus.engine.states import FusedStates, LocalStates
+from saltus.engine.tally import Tally, tally
 from saltus.records import Plots
 from saltus.tracks.faults import History, plot_law
-from saltus.tracks.kinematics import Moments
+from saltus.tracks.health import Health
 from saltus.tracks.local import Party
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.noise import estimate_noise
-from saltus.tracks.output import assignment_table, innovation_table, track_table
+from saltus.tracks.output import innovation_table, track_table
 from saltus.tracks.rows import ConditionFound, Fates, Rows, Tracked, assignments, join_rows
 
 __all__ = ["Result", "finished", "heard_so_far", "order_of_systems"]
 
 _Index = npt.NDArray[np.int64]
 
-_AT_ONCE = 50_000  # rows made into a table at a time
+_AT_ONCE = 1 << 14  # rows made into a table at a time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """Tables and findings of a session."""
+    """Tables and findings of a session; the long tables lie in files and are mapped into memory."""
 
     tracks: pa.Table  # columns of tracks.parquet
     assignments: pa.Table  # columns of assignments.parquet, one row for each report in order of arrival
@@ -48,12 +54,20 @@ class Result:
     gates: pa.Table  # of the updates, for the report
     reason: npt.NDArray[np.int8]  # of each report, index into `records.REASONS`
     setup: Setup
-    tracked: Tracked
     whole: Identified
+    outcome: Outcome
+    figures: Figures
+    conditions: Sequence[ConditionFound]  # of each source
+    span: tuple[float, float]  # first and last time of the reports placed, s
+    stored: Mapping[str, Stored]  # `tracks` and `assignments`, to be read batch by batch
+
+    def sensors(self) -> list[Health]:
+        """Return the faults of each source over time."""
+        return self.figures.health([sensor.name for sensor in self.setup.sensors], self.conditions)
 
 
 def finished(journal: Journal, setup: Setup, files: Sequence[str], health: dict[str, Any]) -> Result:
-    """Make the tables of a session that has ended.
+    """Make the tables of a session that has ended, in memory that holds some bytes of each report.
 
     Args:
         journal: everything that became known.
@@ -61,23 +75,50 @@ def finished(journal: Journal, setup: Setup, files: Sequence[str], health: dict[
         files: names of the files that reports came from.
         health: as told last.
     """
-    plots, tracked = _reports(journal, setup, files), _all_tracked(journal, setup)
-    foreign = journal.all("foreign")
-    whole, joined = together(setup, tracked, plots, None if foreign is None else pa.table(foreign))
-    setup = _with_estimates(setup, tracked)
-    tracks, gates = _tables(joined, setup)
+    told, place = tally(journal, setup), Place()
+    whole = identify(journal, setup, told)
+    states: LocalStates | FusedStates = LocalStates(journal, told, _conditions(journal, setup))
+    if len(whole.systems) > 1:
+        states = FusedStates(journal, setup, told, whole)
+    setup = _with_estimates(setup, journal, told)
+    figures, tracks, gates = _written(states, setup, place)
+    sources = tuple(s.source for s in setup.sensors)
+    became = outcome(journal, told, states.track, sources, files, place)
     return Result(
-        tracks=tracks,
-        assignments=assignment_table(plots, joined.measurements, joined.assignments),
+        tracks=tracks.table(),
+        assignments=became.stored.table(),
         identifications=identification_table(whole),
         biases=bias_tables(whole),
         health=health,
-        gates=gates,
-        reason=plots.reason,
+        gates=gates.table(),
+        reason=told.reason,
         setup=setup,
-        tracked=joined,
         whole=whole,
+        outcome=became,
+        figures=figures,
+        conditions=states.conditions,
+        span=states.span,
+        stored={"tracks": tracks, "assignments": became.stored},
     )
+
+
+def _written(states: LocalStates | FusedStates, setup: Setup, place: Place) -> tuple[Figures, Stored, Stored]:
+    """Write the rows of tracks that were confirmed at some time, as they became known, and their gates."""
+    names, config = [str(s.source.system) for s in setup.sensors], setup.config
+    figures, order = RunFigures(len(names), place), InOrder(_AT_ONCE)
+    tracks, gates = Spool(place, "tracks"), Spool(place, "gates")
+
+    def write(rows: Rows) -> None:
+        tracks.write(track_table(rows, setup.plane, config.tracker.sigma_pressure))
+        gates.write(innovation_table(rows, setup.plane, names))
+
+    for rows, published, before in states:
+        figures.add(rows, published)
+        for batch in order.add(rows.take(published), before):
+            write(batch)
+    for batch in order.end():
+        write(batch)
+    return figures.found(), tracks.stored(), gates.stored()
 
 
 def heard_so_far(journal: Journal, setup: Setup) -> list[tuple[int, Heard]]:
@@ -88,7 +129,7 @@ def heard_so_far(journal: Journal, setup: Setup) -> list[tuple[int, Heard]]:
         placed = [_chosen(part, np.isin(part["source"], party.sources)) for part in journal.parts("plots")]
         if any(len(part["plot"]) for part in placed):
             m, own = Measurements.join([Measurements(**part) for part in placed]), party.sources[0]
-            rows = join_rows([_rows(_chosen(p, p["system"] == own)) for p in journal.parts("rows")])
+            rows = join_rows([rows_of(p, p["system"] == own) for p in journal.parts("rows")])
             out.append((own, Heard(m, np.asarray(reports["local_id"], np.int64)[m.plot], rows)))
     return out
 
@@ -110,14 +151,25 @@ def _all_tracked(journal: Journal, setup: Setup) -> dict[Party, Tracked]:
     return {party: t for party in parties if (t := _tracked(journal, setup, party)) is not None}
 
 
-def _with_estimates(setup: Setup, tracked: Mapping[Party, Tracked]) -> Setup:
+def _with_estimates(setup: Setup, journal: Journal, told: Tally) -> Setup:
     """Estimate, to be told, the noise of sources whose noise was not learnt: configured, or they appeared later."""
     sensors = list(setup.sensors)
-    for party, t in tracked.items():
-        found = t.assignments
-        track = np.where(np.isin(found.track_id, found.confirmed), found.track_id, 0)
-        for s in (s for s in party.sources if not sensors[s].estimate.n_windows):
-            sensors[s] = replace(sensors[s], estimate=estimate_noise(t.measurements, track, s))
+    ever = {s: p.ever for p in told.parties for s in p.party.sources if not sensors[s].estimate.n_windows}
+    found: dict[int, list[Measurements]] = {s: [] for s in ever}
+    missing = dict.fromkeys(ever, setup.config.setup.estimated)
+    for part in journal.parts("plots") if ever else ():
+        m = Measurements(**part)
+        for s in [s for s, n in missing.items() if n]:
+            own = np.flatnonzero(m.source == s)[: missing[s]]
+            found[s].append(m.take(own))
+            missing[s] -= len(own)
+        if not any(missing.values()):
+            break
+    for s, parts in found.items():
+        m = Measurements.join(parts)
+        track = told.track[m.plot].astype(np.int64)
+        estimate = estimate_noise(m, np.where(np.isin(track, ever[s]), track, 0), s)
+        sensors[s] = replace(sensors[s], estimate=estimate)
     return replace(setup, sensors=tuple(sensors))
 
 
@@ -138,17 +190,12 @@ def _tracked(journal: Journal, setup: Setup, party: Party) -> Tracked | None:
     if not len(m):
         return None
     own = party.sources[0]
-    rows = join_rows([_rows(_chosen(p, p["system"] == own)) for p in journal.parts("rows")])
+    rows = join_rows([rows_of(p, p["system"] == own) for p in journal.parts("rows")])
     place = np.full(int(m.plot.max()) + 1, -1)
     place[m.plot] = np.arange(len(m))
     rows = rows._replace(measurement=np.where(rows.measurement >= 0, place[rows.measurement], -1))
     found = assignments(m.plot, _fates(journal, own), [_confirmed(journal, own)], _conditions(journal, setup))
     return Tracked([rows], m, found)
-
-
-def _rows(columns: dict[str, npt.NDArray[Any]]) -> Rows:
-    moments = Moments(*(columns[name] for name in Moments._fields))
-    return Rows(moments=moments, **{name: columns[name] for name in Rows._fields if name != "moments"})
 
 
 def _fates(journal: Journal, own: int) -> Fates:
@@ -177,15 +224,3 @@ def _conditions(journal: Journal, setup: Setup) -> list[ConditionFound]:
 
 def _chosen(columns: dict[str, npt.NDArray[Any]], keep: npt.NDArray[np.bool_]) -> dict[str, npt.NDArray[Any]]:
     return {name: values[keep] for name, values in columns.items()}
-
-
-def _tables(tracked: Tracked, setup: Setup) -> tuple[pa.Table, pa.Table]:
-    """Return the rows of tracks that were confirmed at some time, as they became known, and their gates."""
-    rows = join_rows(tracked.rows)
-    names = [str(s.source.system) for s in setup.sensors]
-    at = np.flatnonzero(np.isin(rows.track_id, tracked.assignments.confirmed))
-    at = at[np.lexsort((rows.time[at], rows.track_id[at], rows.time_known[at]))]
-    parts = [rows.take(at[k : k + _AT_ONCE]) for k in range(0, max(1, len(at)), _AT_ONCE)]
-    tracks = [track_table(part, setup.plane, setup.config.tracker.sigma_pressure) for part in parts]
-    gates = [innovation_table(part, setup.plane, names) for part in parts]
-    return pa.concat_tables(tracks), pa.concat_tables(gates)

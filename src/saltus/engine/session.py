@@ -200,7 +200,7 @@ class Session:
             self._learn()
         for own, tracking in self._locals.items():
             self._tell(own, tracking.end())
-        self._ended = True
+        self._ended, self._live, self._locals = True, None, {}
         setup = with_new_sources(self.setup, self._sources, self.setup.time, self._periods)  # lists the unusable, too
         result = finished(self._journal, setup, self._files, self.health())
         self._journal.close()

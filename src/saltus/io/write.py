@@ -4,7 +4,7 @@ import errno
 import json
 import os
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,8 +15,9 @@ from saltus.io.publish import is_stage, open_stage, publish, settle, sweep
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["blamed", "output_directory", "output_file", "write_json", "write_table", "write_text"]
+__all__ = ["blamed", "output_directory", "output_file", "write_batches", "write_json", "write_table", "write_text"]
 
+_GROUP = 1 << 17  # rows of a table that are written together
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
@@ -124,6 +125,30 @@ def write_table(path: Path, table: "pa.Table") -> None:
 
     with blamed(path), path.open("wb") as file:
         pq.write_table(table, file)
+
+
+def write_batches(path: Path, batches: Iterable["pa.Table"]) -> None:
+    """Write batches of one table as Parquet, so many rows a group; a failure names the file.
+
+    Raises:
+        ValueError: there is none.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    batches = iter(batches)
+    first = next(batches, None)
+    if first is None:
+        raise ValueError(f"{path}: a table has one batch at least, which says what its columns are.")
+    with blamed(path), path.open("wb") as file, pq.ParquetWriter(file, first.schema) as writer:
+        waiting, n = [first], first.num_rows
+        for batch in batches:
+            if n + batch.num_rows > _GROUP:
+                writer.write_table(pa.concat_tables(waiting))
+                waiting, n = [], 0
+            waiting.append(batch)
+            n += batch.num_rows
+        writer.write_table(pa.concat_tables(waiting))
 
 
 @contextmanager

@@ -10,7 +10,7 @@ import pyarrow as pa
 from saltus.config import Config, load_config
 from saltus.engine import Result
 from saltus.io.inputs import expand, left_out
-from saltus.io.write import output_directory, write_json, write_table
+from saltus.io.write import output_directory, write_batches, write_json, write_table
 from saltus.progress import Progress, progress_bar
 from saltus.records import Plots, Recording
 from saltus.run.follow import Feeding, fingerprint, follow
@@ -24,7 +24,7 @@ from saltus.run.identified import (
 from saltus.run.problems import called, set_up, without_tracks
 from saltus.run.seen import Seen
 from saltus.run.window import Window
-from saltus.summary import health_of, noise_rows, show_summary, summarise, why_no_track
+from saltus.summary import noise_rows, show_summary, summarise, why_no_track
 
 __all__ = ["Options", "track_files", "track_recording", "write_tracks"]
 
@@ -139,11 +139,10 @@ def write_tracks(
 def _summary(inputs: Sequence[Path], result: Result, lines: Sequence[str], seen: Seen) -> dict[str, object]:
     """Sum up a run; `lines` are of its reading."""
     names, whole = called(result.setup), result.whole
-    found = len(result.tracked.assignments.confirmed)
     problems = [
         *lines,
         *set_up(result.setup, seen.unplaced),
-        *(without_tracks(result) if found else [why_no_track(result)]),
+        *(without_tracks(result) if result.outcome.confirmed else [why_no_track(result)]),
         *address_lines(whole, names),
         *conflict_lines(whole, names),
     ]
@@ -203,15 +202,15 @@ def _report(path: Path, seen: Seen, result: Result, summary: dict[str, object]) 
         innovations=result.gates,
         summary={**summary, "noise": noise_rows(summary)},
         sites={str(s.source.system): s.site for s in sensors if s.site is not None},
-        sensors=health_of(result),
+        sensors=result.sensors(),
         systems=systems_found(result.whole, result.setup.config.systems, names),
         names=names,
     )
 
 
 def _write(folder: Path, result: Result, summary: dict[str, object]) -> None:
-    write_table(folder / "tracks.parquet", result.tracks)
-    write_table(folder / "assignments.parquet", result.assignments)
+    for name, table in result.stored.items():
+        write_batches(folder / f"{name}.parquet", table.batches())
     write_table(folder / "identifications.parquet", result.identifications)
     write_json(folder / "biases.json", result.biases)
     write_json(folder / "summary.json", summary)

@@ -4,11 +4,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from saltus.engine.identified import Identified, bias_tables, biases, published_tracks
 from saltus.report.systems import CONFLICTS, SystemsFound
-from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.membership import Segments
 from saltus.tracks.picture import decision_settings
 from saltus.tracks.settings import SystemsSettings
@@ -67,11 +65,11 @@ def address_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
     """Say of which two systems the same addresses are far from each other, or seen at other times."""
     lines = []
     for i, a in enumerate(whole.systems):
-        for b in whole.systems[i + 1 :]:
-            common = np.intersect1d(a.view.icao24[a.view.icao24 >= 0], b.view.icao24)
+        for j, b in enumerate(whole.systems[i + 1 :], start=i + 1):
+            common = np.intersect1d(a.address[a.address >= 0], b.address)
             if len(common) < _FEWEST:
                 continue
-            apart = [d for d in (_apart(a.view, b.view, int(code)) for code in common) if np.isfinite(d)]
+            apart = [whole.apart[i, j, code] for code in common.tolist() if (i, j, code) in whole.apart]
             both = (
                 f"{titles.get(a.name, a.name)} and {titles.get(b.name, b.name)} have {len(common)} addresses in common"
             )
@@ -81,23 +79,6 @@ def address_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
                 far = float(np.median(apart)) / 1000.0
                 lines.append(f"{both}, {far:.1f} km apart at one time (median): check sites, units, dates and clocks.")
     return lines
-
-
-def _apart(a: SystemTracks, b: SystemTracks, code: int) -> float:
-    """Median distance between the positions of one address in two systems while both have it, m; NaN if never."""
-    (ta, za), (tb, zb) = (_of(view, code) for view in (a, b))
-    inside = (ta >= tb[0]) & (ta <= tb[-1])
-    if not inside.any():
-        return float("nan")
-    at_b = np.column_stack([np.interp(ta[inside], tb, zb[:, axis]) for axis in (0, 1)])
-    return float(np.median(np.linalg.norm(za[inside] - at_b, axis=-1)))
-
-
-def _of(view: SystemTracks, code: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Times and positions of one address, in time order."""
-    rows = np.flatnonzero(np.isin(view.tracks.track, np.flatnonzero(view.icao24 == code)))
-    rows = rows[np.argsort(view.tracks.time[rows], kind="stable")]
-    return view.tracks.time[rows], view.tracks.z[rows]
 
 
 def system_lines(whole: Identified, titles: Mapping[str, str]) -> list[str]:
@@ -137,7 +118,7 @@ def systems_found(whole: Identified, settings: SystemsSettings, titles: Mapping[
         titles=tuple(titles.get(x.name, x.name) for x in whole.systems),
         system=np.repeat(np.arange(len(whole.systems)), [len(x.ids) for x in whole.systems]),
         local_id=tuple(label for x in whole.systems for label in x.local_id),
-        address=np.concatenate([x.view.icao24 for x in whole.systems]),
+        address=np.concatenate([x.address for x in whole.systems]),
         segments=Segments(*(column[published] for column in whole.segments)),
         decisions=whole.decisions,
         evidence=whole.evidence,

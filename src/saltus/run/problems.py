@@ -56,10 +56,7 @@ def _site_wanted(system: System, count: int) -> str:
 
 def without_tracks(result: Result) -> list[str]:
     """Say which sources gave many positions and no track."""
-    m, found = result.tracked.measurements, result.tracked.assignments
-    sensors, placed = result.setup.sensors, np.isfinite(m.position[:, 0])
-    count = np.bincount(m.source[placed], minlength=len(sensors))
-    on = np.bincount(m.source[placed & np.isin(found.track_id, found.confirmed)], minlength=len(sensors))
+    sensors, count, on = result.setup.sensors, result.outcome.placed, result.outcome.tracked
     return [
         f"{sensors[s].name}: {count[s]} reports and no track: is its update period {sensors[s].period:.3g} s? "
         "Give period (s) in its [[sensor]] table."

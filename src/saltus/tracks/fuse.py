@@ -171,7 +171,7 @@ class Fusion:
     def _publish(self, m: Measurements, rows: _Index, given: Candidates, told: Told, known: float) -> list[Rows]:
         life, moments = self._life, self._kinematics.moments(rows)
         life.mean[rows], life.cov[rows] = moments.mean, moments.cov
-        return [updated_rows(life, rows, moments, m, given.number, told, known)._replace(measurement=given.number)]
+        return [updated_rows(life, rows, moments, m, given.number, told, known)]
 
 
 def _turns(track: _Index) -> Iterator[_Index]:

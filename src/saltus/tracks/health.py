@@ -9,7 +9,7 @@ import numpy.typing as npt
 from saltus.tracks.faults import History, PlotLaw
 from saltus.tracks.rows import ConditionFound
 
-__all__ = ["NIS_FITS", "Degraded", "Health", "degraded_intervals", "nis_interval", "sensor_health"]
+__all__ = ["NIS_FITS", "Degraded", "Health", "degraded_intervals", "flagged", "nis_interval", "sensor_health"]
 
 NIS_FITS = (1.1, 2.2)  # mean NIS of two components, see `nis_interval`
 
@@ -63,12 +63,16 @@ def degraded_intervals(history: History, law: PlotLaw) -> list[Degraded]:
     return out
 
 
+def flagged(p_fault: _Array, fault: npt.NDArray[np.int8]) -> npt.NDArray[np.int8]:
+    """Return the fault of each plot, 1 + component, 0 where it is more probably right; (N,) probabilities and kinds."""
+    return np.where(p_fault > _FLAG, fault, 0).astype(np.int8)
+
+
 def sensor_health(
     names: Sequence[str],
     sources: Sequence[ConditionFound],
     source: npt.NDArray[np.int32],
     time: _Array,
-    p_fault: _Array,
     fault: npt.NDArray[np.int8],
 ) -> list[Health]:
     """Gather what was found of each source.
@@ -76,19 +80,18 @@ def sensor_health(
     Args:
         names: of the sources.
         sources: their conditions.
-        source: of each plot that updated a confirmed track, index, (N,).
+        source: of each plot that updated a confirmed track and was judged, index, (N,).
         time: of it, s.
-        p_fault: probability that it was faulty, NaN where nothing told.
-        fault: its likeliest fault, 1 + component.
+        fault: its fault (`flagged`).
     """
     out = []
     for s, (name, condition) in enumerate(zip(names, sources, strict=True)):
-        mine = np.flatnonzero((source == s) & np.isfinite(p_fault))
+        mine = np.flatnonzero(source == s)
         mine = mine[np.argsort(time[mine], kind="stable")]
         history, law = condition.history, condition.law
-        kinds = np.where(p_fault[mine] > _FLAG, fault[mine], 0).astype(np.int8)
         p = history.probs @ law.degraded
-        out.append(Health(name, law.components, time[mine], kinds, history.time, p, degraded_intervals(history, law)))
+        intervals = degraded_intervals(history, law)
+        out.append(Health(name, law.components, time[mine], fault[mine], history.time, p, intervals))
     return out
 
 

@@ -1,7 +1,7 @@
 """The local tracks of each system, as registration and identification see them."""
 
 from collections.abc import Sequence
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.rows import Assignments, Rows
 
-__all__ = ["LocalSystem", "Party", "foreign_systems", "group_sources", "local_system"]
+__all__ = ["LocalSystem", "Misfit", "Party", "foreign_systems", "group_sources", "local_system", "stated"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
@@ -95,9 +95,9 @@ def local_system(
     known = np.full(len(m), np.nan)
     known[rows.measurement[update]] = rows.time_known[update]
     known = np.where(np.isnan(known[at]), ready[track], known[at])  # a track's first plots, told with a later one
-    R = (m.cov[at] + m.stamped(at, velocity[at]))[:, :2, :2] * m.inflation[at, None, None]
+    R = stated(m, at, velocity[at])
     noise = float(np.sqrt(np.median(np.trace(R, axis1=-2, axis2=-1)) / 2.0)) if len(at) else np.inf
-    R = R * _misfit(track, m.time[at], m.position[at, :2], R)[:, None, None]
+    R = R * Misfit().factor(track, m.time[at], m.position[at, :2], R)[:, None, None]
     icao24 = np.array([_commonest(m.icao24[at], track, k) for k in range(len(ids))], np.int64)
     own = np.array([_commonest(np.asarray(numbers)[at], track, k) for k in range(len(ids))], np.int64)
     mode3a = np.array([_commonest(m.mode3a[at], track, k) for k in range(len(ids))], np.int64)
@@ -114,16 +114,77 @@ def local_system(
     return LocalSystem(name, view, mode3a if use_identity else hidden, label, ready, ids, at, noise, known, codes)
 
 
-def _misfit(track: _Index, time: _Array, z: _Array, R: _Array) -> _Array:
+def stated(m: Measurements, at: npt.NDArray[np.intp], velocity: _Array) -> _Array:
+    """Return the stated covariance of positions, (k, 2, 2), m^2; `velocity` (k, 2) is that of the targets, m/s."""
+    return np.asarray((m.cov[at] + m.stamped(at, velocity))[:, :2, :2] * m.inflation[at, None, None])
+
+
+class Misfit:
     """Factor of the stated variance that each track's latest reports ask for, at least 1.
 
     The middle one of three reports lies off the line through the others by its error, theirs in part, and what an
     acceleration does. A running mean of d2 / 2 over some ten of these, each cut at a value that a gross outlier cannot
     exceed, is known one report later.
     """
-    out = np.ones(len(time))
+
+    def __init__(self) -> None:
+        """Begin without reports."""
+        self._last: dict[int, _Latest] = {}
+
+    def factor(self, track: _Index, time: _Array, z: _Array, R: _Array) -> _Array:
+        """Return the factor of each of the next reports.
+
+        Args:
+            track: of each, sorted, (n,).
+            time: not decreasing within a track, s.
+            z: positions (n, 2), m.
+            R: stated covariances (n, 2, 2), m^2.
+        """
+        if not len(track):
+            return np.ones(0)
+        edge = np.flatnonzero(np.diff(track, prepend=-1, append=-1))
+        before = [self._last.get(int(track[k]), _NEW) for k in edge[:-1].tolist()]
+        n = [len(x.time) for x in before]
+        put = np.repeat(edge[:-1], n)
+        rows = np.full(len(time), True)
+        rows = np.insert(rows, put, False)
+        time, track = np.insert(time, put, [t for x in before for t in x.time]), np.insert(track, put, track[put])
+        z = np.insert(z, put, [row for x in before for row in x.z], axis=0) if len(put) else z
+        R = np.insert(R, put, [row for x in before for row in x.R], axis=0) if len(put) else R
+        value, out = _offsets(track, time, z, R), np.ones(len(time))
+        starts = edge[:-1] + np.cumsum([0, *n[:-1]])
+        for first, stop, old in zip(starts.tolist(), [*starts[1:].tolist(), len(time)], before, strict=True):
+            known = len(old.time)
+            value[first : first + 2] = 1.0
+            begin = [old.mean] if known else [float(value[first])]
+            out[first + max(known - 1, 0) : stop] = list(
+                accumulate([*begin, *value[first + max(known, 1) : stop].tolist()], _running)
+            )
+            late = slice(max(first, stop - 2), stop)
+            self._last[int(track[first])] = _Latest(time[late].tolist(), z[late], R[late], float(out[stop - 1]))
+        return np.asarray(np.maximum(out[rows], 1.0))
+
+    def forget(self, before: float) -> None:
+        """Forget tracks without a report since a time, s."""
+        self._last = {track: x for track, x in self._last.items() if x.time[-1] >= before}
+
+
+class _Latest(NamedTuple):
+    """The last two reports of a track, and its running mean."""
+
+    time: list[float]
+    z: _Array
+    R: _Array
+    mean: float
+
+
+_NEW = _Latest([], np.zeros((0, 2)), np.zeros((0, 2, 2)), 1.0)
+
+
+def _offsets(track: _Index, time: _Array, z: _Array, R: _Array) -> _Array:
+    """Half the squared distance of the middle one of each row and the two before it; 1 for the first two of all."""
     if len(time) < 3:
-        return out
+        return np.ones(len(time))
     whole = track[2:] == track[:-2]
     before, after = time[1:-1] - time[:-2], time[2:] - time[1:-1]
     w = np.where(before + after > 0, before / np.maximum(before + after, 1e-9), 0.5)[:, None]
@@ -132,12 +193,7 @@ def _misfit(track: _Index, time: _Array, z: _Array, R: _Array) -> _Array:
     bent = (0.5 * _ACCEL * before * after)[:, None, None] ** 2 * np.eye(2)
     S = R[1:-1] + (1.0 - w) ** 2 * R[:-2] + w**2 * R[2:] + bent
     d2 = np.where(whole, np.einsum("ni,nij,nj->n", e, np.linalg.inv(S), e), 2.0)
-    value = np.concatenate([[1.0, 1.0], np.minimum(d2, _CUT) / 2.0])  # row k knows the middle ones up to k - 1
-    edge = np.flatnonzero(np.diff(track, prepend=-1, append=-1))
-    for first, stop in pairwise(edge):
-        value[first : first + 2] = 1.0
-        out[first:stop] = list(accumulate(value[first:stop].tolist(), _running))
-    return np.maximum(out, 1.0)
+    return np.concatenate([[1.0, 1.0], np.minimum(d2, _CUT) / 2.0])  # row k knows the middle ones up to k - 1
 
 
 def _running(mean: float, value: float) -> float:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from saltus.shapes import Float, Int
 
-__all__ = ["Change", "Local", "Membership", "Merger", "Segments", "known_since"]
+__all__ = ["Change", "KnownSince", "Local", "Membership", "Merger", "Segments"]
 
 _Array = npt.NDArray[np.float64]
 
@@ -313,21 +313,34 @@ class Membership:
         return Segments(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def known_since(changes: Sequence[Change], number: Int[np.ndarray, " n"], time: _Array) -> _Array:
-    """Return when it became known what system tracks are made of up to given times, (n,), s; -inf: always.
+class KnownSince:
+    """When it became known what system tracks are made of."""
 
-    Args:
-        changes: of memberships.
-        number: system tracks, (n,).
-        time: up to which their reports count, (n,), s.
-    """
-    out = np.full(len(number), -np.inf)
-    if not changes:
+    def __init__(self, changes: Sequence[Change]) -> None:
+        """Take all changes of memberships."""
+        of, since, known = (
+            (np.array(column) for column in zip(*changes, strict=True)) if changes else (np.zeros(0),) * 3
+        )
+        order = np.lexsort((since, of))
+        self._number, first = np.unique(of[order], return_index=True)
+        self._since = np.split(since[order], first[1:])
+        latest = np.split(known[order], first[1:])
+        self._latest = [np.append(-np.inf, np.maximum.accumulate(known)) for known in latest]
+
+    def at(self, number: Int[np.ndarray, " n"], time: _Array) -> _Array:
+        """Return when it was known what system tracks are made of up to given times, (n,), s; -inf: always.
+
+        Args:
+            number: system tracks, (n,).
+            time: up to which their reports count, (n,), s.
+        """
+        out = np.full(len(number), -np.inf)
+        if not len(number):
+            return out
+        order = np.argsort(number, kind="stable")
+        numbers, first = np.unique(number[order], return_index=True)
+        for n, rows in zip(numbers.tolist(), np.split(order, first[1:]), strict=True):
+            k = int(np.searchsorted(self._number, n))
+            if k < len(self._number) and self._number[k] == n:
+                out[rows] = self._latest[k][np.searchsorted(self._since[k], time[rows], side="right")]
         return out
-    of, since, known = (np.array(column) for column in zip(*changes, strict=True))
-    for n in np.unique(number).tolist():
-        rows, mine = np.flatnonzero(number == n), np.flatnonzero(of == n)
-        mine = mine[np.argsort(since[mine], kind="stable")]
-        latest = np.append(-np.inf, np.maximum.accumulate(known[mine]))
-        out[rows] = latest[np.searchsorted(since[mine], time[rows], side="right")]
-    return out

@@ -1,6 +1,7 @@
 """Published rows as tables: true north and east at the target, degrees where people read them."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -9,8 +10,7 @@ import pyarrow as pa
 from saltus.geo import Plane
 from saltus.records import REASONS, Plots
 from saltus.tracks.lifecycle import STATUS
-from saltus.tracks.measurements import Measurements
-from saltus.tracks.rows import Assignments, Rows
+from saltus.tracks.rows import Rows
 
 __all__ = [
     "BEARING",
@@ -18,6 +18,7 @@ __all__ = [
     "NOT_CONFIRMED",
     "SINGLE",
     "SPLIT",
+    "Fate",
     "assignment_table",
     "innovation_table",
     "report_table",
@@ -25,6 +26,7 @@ __all__ = [
 ]
 
 _Array = npt.NDArray[np.float64]
+_Mask = npt.NDArray[np.bool_]
 
 SPLIT = "split plot"
 ELSEWHERE = "address elsewhere"  # far from the track that has its address
@@ -109,20 +111,24 @@ def innovation_table(rows: Rows, plane: Plane, names: Sequence[str]) -> pa.Table
     )
 
 
-def assignment_table(plots: Plots, m: Measurements, assignments: Assignments) -> pa.Table:
-    """Return one row per target report read: the track it belongs to, or why none."""
-    track_id = np.zeros(len(plots), np.int64)
-    reason = np.array(REASONS, object)[plots.reason]
-    ids = assignments.track_id
-    kept = np.isin(ids, assignments.confirmed)
-    track_id[m.plot] = np.where(kept, ids, 0)
-    single = np.bincount(ids)[ids] == 1 if len(ids) else np.zeros(0, bool)
-    alone = np.isfinite(m.bearing)
+class Fate(NamedTuple):
+    """What became of reports, as far as their tables tell."""
+
+    placed: _Mask  # whether a tracker was given it
+    bearing: _Mask  # whether it is a bearing alone
+    split: _Mask  # a second plot of a target already updated
+    elsewhere: _Mask  # far from the track that has its address
+    single: _Mask  # the only one of its track, or of no track
+
+
+def assignment_table(plots: Plots, track_id: npt.NDArray[np.int64], fate: Fate) -> pa.Table:
+    """Return one row per target report read: the track it belongs to (0 none), or why none."""
     why = np.select(
-        [alone, assignments.split, assignments.elsewhere, single], [BEARING, SPLIT, ELSEWHERE, SINGLE], NOT_CONFIRMED
+        [~fate.placed, track_id > 0, fate.bearing, fate.split, fate.elsewhere, fate.single],
+        [np.array(REASONS)[plots.reason], "", BEARING, SPLIT, ELSEWHERE, SINGLE],
+        NOT_CONFIRMED,
     )
-    reason[m.plot] = np.where(kept, "", why)
-    return report_table(plots, track_id, [str(r) for r in reason])
+    return report_table(plots, track_id, why.tolist())
 
 
 def report_table(plots: Plots, track_id: npt.NDArray[np.int64], reason: Sequence[str]) -> pa.Table:

@@ -277,15 +277,18 @@ class SetupSettings:
         reports: of each source.
         seconds: of data.
         fewest: reports of each source from which something can be learnt.
+        estimated: first reports of a source whose noise is configured, or that appeared later, from which its noise is
+            estimated after the end, to be told.
     """
 
     reports: int = 5_000
     seconds: float = 600.0
     fewest: int = 500
+    estimated: int = 100_000
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""
-        for name in ("reports", "fewest"):
+        for name in ("reports", "fewest", "estimated"):
             if not getattr(self, name) >= 1:
                 raise ModelError(f"setup.{name} is a number of reports, 1 or more, got {getattr(self, name)}.")
         if not 0.0 < self.seconds < np.inf:

@@ -1,28 +1,26 @@
 """System tracks as published rows: who belongs together, states from all measurements, what became of each plot."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import fields
-from itertools import pairwise
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.bias import corrected, effects, learnt, spread
+from saltus.tracks.bias import BiasSeries, corrected, effects, learnt, spread
 from saltus.tracks.faults import PlotLaw, SourceCondition
 from saltus.tracks.fuse import Candidates, Fusion
-from saltus.tracks.lanes import Lanes, is_first, latest, since
+from saltus.tracks.lanes import is_first, latest, since
 from saltus.tracks.lifecycle import CONFIRMED
-from saltus.tracks.local import LocalSystem
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.membership import Segments
-from saltus.tracks.rows import Assignments, ConditionFound, Rows, join_rows
+from saltus.tracks.rows import Rows, join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.slices import slices
 from saltus.tracks.splits import second_echoes
 from saltus.tracks.systems import Registered, lasting_differences
+from saltus.tracks.window import Reported
 
-__all__ = ["Part", "SystemTracking", "track_systems"]
+__all__ = ["Fused", "SystemTracking"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
@@ -33,231 +31,276 @@ _LATELY = 30.0  # s within which another system must have seen a target for its 
 _STEP = 2.0  # standard deviations of a report by which a correction steps, from which a state is moved with it
 
 
-class Part(NamedTuple):
-    """What the tracker of one system found, and how the system was registered."""
+class Fused(NamedTuple):
+    """What is known anew of system tracks."""
 
-    system: LocalSystem
-    registered: Registered
-    m: Measurements
-    found: Assignments
-    rows: Rows
-    own: _Index  # sources of the system
-
-
-class SystemTracking(NamedTuple):
-    """System tracks over the measurements of all systems."""
-
-    rows: Rows
-    measurements: Measurements
-    assignments: Assignments
+    rows: Rows  # `measurement` is the number of the plot
+    plot: _Index  # numbers of reports
+    track: _Index  # system track of each, 0 none
+    before: float  # s: no row to come is known before that
+    time: _Array  # s: of the reports, corrected
 
 
-class _Scene(NamedTuple):
-    """Everything measured, of all systems."""
+class _Corrected(NamedTuple):
+    """Reports of one system or all, corrected for biases as known at their times."""
 
-    parts: Sequence[Part]
-    m: Measurements  # corrected for biases, in time order
-    rows: Rows  # of the local trackers, measurements numbered as in m
-    owner: _Index  # part of each measurement
-    time: _Array  # of each measurement, as reported, s
-    velocity: _Array  # (N, 2): what the local tracker said of its target, 0 where it said nothing, m/s
-    doubt: _Array  # (N, 2, 2): what uncertain biases leave of each position, m^2
-    shift: _Array  # (N, 2): what corrections moved each position by, m
-    turn: _Array  # (N,): and turned directions by, rad
+    m: Measurements  # corrected
+    time: _Array  # as reported, s
+    owner: _Index  # system
+    local: _Index  # local track through all systems, -1 none that is ever confirmed
+    updated: _Mask  # whether the local tracker published a row of it
+    mean: _Array  # (n, 6): state after it, by the local tracker
+    cov: _Array
+    status: npt.NDArray[np.int8]
+    shift: _Array  # (n, 2): what corrections moved the position by, m
+    turn: _Array  # (n,): and turned directions by, rad
+    doubt: _Array  # (n, 2, 2): what uncertain biases leave of the position, m^2
+
+    @property
+    def velocity(self) -> _Array:
+        """What the local tracker said of the target, 0 where it said nothing, (n, 2), m/s."""
+        return np.where(self.updated[:, None], self.mean[:, [1, 3]], 0.0)
+
+    @property
+    def usable(self) -> _Mask:
+        """Whether there is a state after a position."""
+        return np.asarray(self.updated & np.isfinite(self.m.position[:, 0]))
+
+    def take(self, at: npt.NDArray[np.integer] | _Mask) -> "_Corrected":
+        """Return those selected."""
+        where = np.arange(len(self.time))[at]
+        return _Corrected._make([self.m.take(where), *(column[where] for column in self[1:])])
 
 
-def track_systems(
-    parts: Sequence[Part],
-    segments: Segments,
-    filters: FilterSettings,
-    settings: TrackerSettings,
-    periods: Sequence[float],
-    *,
-    use_identity: bool,
-) -> SystemTracking:
-    """Publish system tracks.
+def _joined(parts: Sequence[_Corrected]) -> _Corrected:
+    columns = [np.concatenate(column) for column in zip(*(part[1:] for part in parts), strict=True)]
+    return _Corrected._make([Measurements.join([part.m for part in parts]), *columns])
+
+
+class SystemTracking:
+    """System tracks, fed with the reports of all systems in order of time.
 
     Every system track begins in the state in which its first local track was published, and is updated by all reports
     of its local tracks in exact time order, corrected for the biases of their systems (`Fusion`). Second echoes move no
-    state.
+    state. Who belongs together is known beforehand.
+    """
+
+    def __init__(
+        self,
+        ids: Sequence[_Index],
+        registered: Sequence[Registered],
+        segments: Segments,
+        laws: Sequence[PlotLaw],
+        filters: FilterSettings,
+        settings: TrackerSettings,
+        periods: Sequence[float],
+        *,
+        use_identity: bool,
+    ) -> None:
+        """Begin without reports.
+
+        Args:
+            ids: each local tracker's numbers of its tracks, in the order in which local tracks are numbered.
+            registered: how each of these systems was.
+            segments: to which system track each local track belongs, and when.
+            laws: what may be wrong with reports of each source.
+            filters: manoeuvres.
+            settings: faults, coasting.
+            periods: s without a report after which a target counts as missed, of each source.
+            use_identity: whether tracks take over addresses and codes.
+        """
+        self._ids, self._registered, self._segments = ids, registered, segments
+        self._first = np.cumsum([0, *(len(own) for own in ids)])
+        self._fusion = Fusion(settings, filters, laws, periods, use_identity=use_identity)
+        self._width = min([_LONGEST, *periods])
+        system = np.repeat(np.arange(len(ids)), [len(own) for own in ids])
+        own = np.flatnonzero(segments.track < len(system))  # another centre's tracks, numbered last, have no reports
+        self._echoes = second_echoes(Segments(*(column[own] for column in segments)), system)
+        late = [r.found.series.mean[:, 5].max(initial=0.0) for r in registered if r.found is not None]
+        self._late = float(max(late, default=0.0))
+        self._pending: list[list[_Corrected]] = [[] for _ in ids]  # others may still come before
+        self._lanes = _Lanes(np.unique(segments.system_track), registered)
+        self._waiting: tuple[Measurements, Candidates] | None = None  # of slices that are not complete
+        self._before = -np.inf  # s: time of the last report of the slices complete
+
+    @property
+    def conditions(self) -> list[SourceCondition]:
+        """The condition of each source."""
+        return self._fusion.conditions
+
+    def feed(self, systems: Sequence[Reported], until: float) -> Fused:
+        """Take the next reports of each system; none that follows is earlier than `until`, s."""
+        known = until - self._late
+        ready: list[_Corrected] = []
+        for k, reported in enumerate(systems):
+            part = _joined([*self._pending[k], self._corrected(k, reported)])
+            early = part.m.time < known
+            self._pending[k] = [part.take(~early)]
+            ready.append(part.take(early))
+        merged = _joined(ready)
+        merged = merged.take(np.argsort(merged.m.time, kind="stable"))
+        of = self._system_tracks(merged)
+        rows = self._fused(merged, of, known)
+        return Fused(rows, merged.m.plot, of, self._before, merged.m.time)
+
+    def _corrected(self, k: int, new: Reported) -> _Corrected:
+        """Take biases out of the reports of one system."""
+        found, m, n = self._registered[k].found, new.m, len(new.m)
+        ids = self._ids[k]
+        local, owner = np.full(n, -1), np.full(n, k)
+        if len(ids):
+            place = np.minimum(np.searchsorted(ids, new.track), len(ids) - 1)
+            local = np.where(ids[place] == new.track, self._first[k] + place, -1)
+        shift, turn, doubt = np.zeros((n, 2)), np.zeros(n), np.zeros((n, 2, 2))
+        if found is not None:
+            m = corrected(new.m, np.arange(n), found.series)
+            mean, cov = found.series.at(new.m.time)
+            doubt = spread(effects(m.ray, new.velocity), cov)
+            shift, turn = m.position[:, :2] - new.m.position[:, :2], mean[:, 2]
+        return _Corrected(m, new.m.time, owner, local, new.updated, new.mean, new.cov, new.status, shift, turn, doubt)
+
+    def _system_tracks(self, merged: _Corrected) -> _Index:
+        """Return the system track of each report, 0 none."""
+        of = np.zeros(len(merged.time), np.int64)
+        known = np.flatnonzero(merged.local >= 0)
+        if len(self._segments.track):
+            at = self._segments.at(merged.local[known], merged.time[known])
+            of[known] = self._segments.system_track[at]
+        return of
+
+    def _fused(self, merged: _Corrected, of: _Index, known: float) -> Rows:
+        """Update states by the reports of slices that are complete."""
+        at = np.flatnonzero((of > 0) & ~self._echoing(merged))
+        at = at[np.lexsort((merged.m.time[at], of[at]))]
+        lanes = merged.take(at)
+        new = self._lanes.candidates(lanes, of[at])
+        order = np.argsort(lanes.m.time, kind="stable")
+        m, candidates = lanes.m.take(order), new.take(order)
+        if self._waiting is not None:
+            old, before = self._waiting
+            m = Measurements.join([old, m])
+            both = zip(before, candidates, strict=True)
+            candidates = Candidates._make(np.concatenate(columns) for columns in both)
+        candidates = candidates._replace(number=np.arange(len(m)))
+        out, stop = [], 0
+        for begin, stop in slices(m.time, self._width, known):
+            out += self._fusion.feed(m, candidates.take(np.arange(begin, stop)))
+        rest = np.arange(stop, len(m))
+        self._waiting = m.take(rest), candidates.take(rest)
+        if stop:
+            self._before = float(m.time[stop - 1])
+        return join_rows(out)
+
+    def _echoing(self, merged: _Corrected) -> _Mask:
+        """Say which reports are of second echoes."""
+        out = np.zeros(len(merged.time), bool)
+        if not len(merged.time):
+            return out
+        first, last = merged.time.min(), merged.time.max()
+        for spell in self._echoes:
+            if spell.time_from <= last and spell.time_to > first:
+                inside = (merged.time >= spell.time_from) & (merged.time < spell.time_to)
+                out |= (merged.local == spell.track) & inside
+        return out
+
+
+class _Lanes:
+    """What is known of each system track so far: which systems saw it, when, and whether it is confirmed."""
+
+    def __init__(self, tracks: _Index, registered: Sequence[Registered]) -> None:
+        """Begin with nothing known of system tracks, sorted by number."""
+        n = len(tracks)
+        self._tracks, self._registered = tracks, registered
+        self._owner = np.full(n, -1)  # system of the first report
+        self._several, self._sure = np.zeros(n, bool), np.zeros(n, bool)
+        self._n = 0  # reports so far
+        self._place = np.full((n, len(registered)), -1)  # of the last one of each system among all
+        self._time = np.full((n, len(registered)), -np.inf)  # its time, s
+        self._usable = np.full((n, len(registered)), -np.inf)  # time of the last usable one
+
+    def candidates(self, r: _Corrected, track: _Index) -> Candidates:
+        """Return reports, sorted by system track and then by time, as candidates; note them."""
+        lane = np.searchsorted(self._tracks, track)
+        first = np.flatnonzero(is_first(lane))
+        last = np.append(first[1:], len(lane)) - 1 if len(first) else first
+        fresh = first[self._owner[lane[first]] < 0]
+        self._owner[lane[fresh]] = r.owner[fresh]
+        several = since(r.owner != self._owner[lane], lane) | self._several[lane]
+        sure = since(r.updated & (r.status == CONFIRMED), lane) | self._sure[lane]
+        self._several[lane[last]], self._sure[lane[last]] = several[last], sure[last]
+        shift, turn = self._reframed(r, lane)
+        self._note(r, lane)
+        n, lasting = len(lane), lasting_differences(self._registered, r.m.time)
+        extra = np.zeros((n, 2, 2))
+        extra[several] = 0.5 * lasting[several, None, None] ** 2 * np.eye(2) + r.doubt[several]
+        mean, cov = _state(r)
+        return Candidates(np.arange(n), track, sure, r.usable, mean, cov, shift, turn, extra)
+
+    def _reframed(self, r: _Corrected, lane: _Index) -> tuple[_Array, _Array]:
+        """Return how far the frame of a track moves before each report (n, 2), m, and turns (n,), rad.
+
+        It does where what is known of a system's biases has stepped further than the noise of its reports. No target
+        moved there: a track that this system sees alone moves with the new frame. Where another system sees it, too,
+        the state is in that one's frame already.
+        """
+        shift, turn = np.zeros((len(lane), 2)), np.zeros(len(lane))
+        for k, registered in enumerate(self._registered):
+            at = np.flatnonzero(r.usable & (r.owner == k))
+            if registered.found is None or not len(at):
+                continue
+            before = self._usable[lane[at], k]
+            again = ~is_first(lane[at])
+            before[again] = r.time[at[np.flatnonzero(again) - 1]]
+            there = np.isfinite(before)
+            at, before = at[there], before[there]
+            moved, turned = _stepped(registered.found.series, r, at, before, r.time[at] - self._met(r, lane, k)[at])
+            shift[at], turn[at] = moved, turned
+        return shift, turn
+
+    def _met(self, r: _Corrected, lane: _Index, k: int) -> _Array:
+        """Return when a system other than k saw each track last, at each report, s."""
+        other = latest(np.where(r.owner == k, -1, np.arange(len(lane))), lane)
+        place = np.where(np.arange(self._place.shape[1]) == k, -1, self._place)
+        newest = place.argmax(axis=1)
+        rows = np.arange(len(place))
+        carried = np.where(place[rows, newest] >= 0, self._time[rows, newest], -np.inf)
+        return np.where(other >= 0, r.time[np.maximum(other, 0)], carried[lane])
+
+    def _note(self, r: _Corrected, lane: _Index) -> None:
+        """Keep the last report of each system in each lane; of equal places the last one assigned stays."""
+        for k in range(len(self._registered)):
+            at = np.flatnonzero(r.owner == k)
+            at = at[np.append(np.diff(lane[at]) != 0, True)] if len(at) else at
+            self._place[lane[at], k], self._time[lane[at], k] = self._n + at, r.time[at]
+            at = np.flatnonzero((r.owner == k) & r.usable)
+            at = at[np.append(np.diff(lane[at]) != 0, True)] if len(at) else at
+            self._usable[lane[at], k] = r.time[at]
+        self._n += len(lane)
+
+
+def _stepped(series: BiasSeries, r: _Corrected, at: _Index, before: _Array, alone: _Array) -> tuple[_Array, _Array]:
+    """Return how far, and by which angle, the frame of one system's reports stepped since the ones before them.
 
     Args:
-        parts: systems in the order in which local tracks are numbered.
-        segments: to which system track each local track belongs, and when.
-        filters: manoeuvres.
-        settings: faults, coasting.
-        periods: s without a report after which a target counts as missed, of each source.
-        use_identity: whether tracks take over addresses and codes.
+        series: biases of the system.
+        r: reports.
+        at: those of the system, (k,).
+        before: times of the ones before, s.
+        alone: s since another system saw the track.
     """
-    m, place = _merged(parts)
-    rows = join_rows([_renumbered(part, at) for part, at in zip(parts, place, strict=True)])
-    first = np.cumsum([0, *(len(p.system.ids) for p in parts)])
-    local, owner = _local_tracks(parts, place, first, len(m))
-    scene = _scene(parts, place, m, rows, owner)
-    segment = np.full(len(m), -1)
-    known = np.flatnonzero(local >= 0)
-    segment[known] = segments.at(local[known], scene.time[known])
-    of = (
-        np.where(segment >= 0, segments.system_track[segment], 0) if len(segments.track) else np.zeros(len(m), np.int64)
-    )
-    lanes = _lanes(m, of, local, rows)
-    lanes = Lanes(*(column[~_echoing(lanes, scene.time, segments, parts)] for column in lanes))
-    laws = [_law(parts, s) for s in range(len(periods))]
-    fusion = Fusion(settings, filters, laws, periods, use_identity=use_identity)
-    published = [part for c in _candidates(lanes, scene, periods) for part in fusion.feed(m, c)]
-    return SystemTracking(join_rows(published), m, _assigned(parts, place, of, fusion.conditions))
+    now, velocity = r.time[at], r.velocity[at]
+    step = learnt(series, r.m.ray[at], velocity, before, now)
+    d2 = np.einsum("ni,nij,nj->n", step, np.linalg.inv(r.m.cov[at, :2, :2]), step)
+    moves = (d2 > _STEP**2) & (alone > _LATELY)
+    azimuth = [series.at(time)[0][:, 2] for time in (before, now)]
+    return np.where(moves[:, None], step, 0.0), np.where(moves, azimuth[1] - azimuth[0], 0.0)
 
 
-def _law(parts: Sequence[Part], source: int) -> PlotLaw:
-    """What may be wrong with reports of a source: as its own system's tracker was told."""
-    own = next((part for part in parts if source in part.own), parts[0])
-    return own.found.sources[source].law
-
-
-def _merged(parts: Sequence[Part]) -> tuple[Measurements, list[_Index]]:
-    """Measurements of all systems, corrected, in time order, and where those of each part went."""
-    fixed = []
-    for part in parts:
-        found = part.registered.found
-        m = part.m if found is None else corrected(part.m, np.arange(len(part.m)), found.series)
-        fixed.append(m)
-    columns = {f.name: np.concatenate([getattr(m, f.name) for m in fixed]) for f in fields(Measurements)}
-    order = np.argsort(columns["time"], kind="stable")
-    where = np.empty(len(order), np.int64)
-    where[order] = np.arange(len(order))
-    edge = np.cumsum([0, *(len(m) for m in fixed)])
-    return Measurements(**{k: v[order] for k, v in columns.items()}), [where[a:b] for a, b in pairwise(edge)]
-
-
-def _scene(parts: Sequence[Part], place: Sequence[_Index], m: Measurements, rows: Rows, owner: _Index) -> _Scene:
-    n = len(m)
-    time, velocity, doubt = np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2, 2))
-    shift, turn = np.zeros((n, 2)), np.zeros(n)
-    update = np.flatnonzero(rows.measurement >= 0)
-    velocity[rows.measurement[update]] = rows.moments.mean[update][:, [1, 3]]
-    for part, at in zip(parts, place, strict=True):
-        time[at] = part.m.time
-        if part.registered.found is not None:
-            mean, cov = part.registered.found.series.at(part.m.time)
-            doubt[at] = spread(effects(m.ray[at], velocity[at]), cov)
-            shift[at], turn[at] = m.position[at, :2] - part.m.position[:, :2], mean[:, 2]
-    return _Scene(parts, m, rows, owner, time, velocity, doubt, shift, turn)
-
-
-def _renumbered(part: Part, at: _Index) -> Rows:
-    """Rows of one system with measurements numbered through all."""
-    rows = part.rows
-    return rows._replace(
-        measurement=np.where(rows.measurement >= 0, at[rows.measurement], -1) if len(at) else rows.measurement
-    )
-
-
-def _local_tracks(parts: Sequence[Part], place: Sequence[_Index], first: _Index, n: int) -> tuple[_Index, _Index]:
-    """Local track of each measurement through all systems (-1: none confirmed), and its part."""
-    local, owner = np.full(n, -1), np.zeros(n, np.int64)
-    for k, (part, at) in enumerate(zip(parts, place, strict=True)):
-        ids = part.system.ids
-        owner[at] = k
-        if len(ids):
-            found = np.minimum(np.searchsorted(ids, part.found.track_id), len(ids) - 1)
-            mine = ids[found] == part.found.track_id
-            local[at] = np.where(mine, first[k] + found, -1)
-    return local, owner
-
-
-def _lanes(m: Measurements, of: _Index, local: _Index, rows: Rows) -> Lanes:
-    row = np.full(len(m), -1)
-    update = np.flatnonzero(rows.measurement >= 0)
-    row[rows.measurement[update]] = update
-    index = np.flatnonzero(of > 0)
-    index = index[np.lexsort((m.time[index], of[index]))]
-    return Lanes(index, of[index], local[index], row[index])
-
-
-def _candidates(lanes: Lanes, scene: _Scene, periods: Sequence[float]) -> Iterator[Candidates]:
-    """Reports of local tracks for system tracks, a slice of time each."""
-    m, owner = scene.m, scene.owner[lanes.number]
-    several = since(
-        owner != owner[np.maximum.accumulate(np.where(is_first(lanes.track), np.arange(len(owner)), 0))], lanes.track
-    )
-    known = (lanes.row >= 0) & (scene.rows.status[np.maximum(lanes.row, 0)] == CONFIRMED)
-    sure, (shift, turn) = since(known, lanes.track), _reframed(lanes, scene)
-    order = np.argsort(m.time[lanes.number], kind="stable")
-    time = m.time[lanes.number[order]]
-    lasting = lasting_differences([part.registered for part in scene.parts], m.time)
-    for begin, end in slices(time, min([_LONGEST, *periods]), np.inf):
-        at = order[begin:end]
-        number, extra = lanes.number[at], np.zeros((end - begin, 2, 2))
-        extra[several[at]] = (
-            0.5 * lasting[number[several[at]], None, None] ** 2 * np.eye(2) + scene.doubt[number[several[at]]]
-        )
-        begins = (lanes.row[at] >= 0) & np.isfinite(m.position[number, 0])
-        mean, cov = _state(scene, number, np.maximum(lanes.row[at], 0))
-        yield Candidates(number, lanes.track[at], sure[at], begins, mean, cov, shift[at], turn[at], extra)
-
-
-def _state(scene: _Scene, number: _Index, row: _Index) -> tuple[_Array, _Array]:
-    """State of the local tracker at rows, moved with the measurement that each was made from."""
-    moments = scene.rows.moments
-    mean, turn = moments.mean[row].copy(), scene.turn[number]
-    mean[:, :3:2] += scene.shift[number]
+def _state(r: _Corrected) -> tuple[_Array, _Array]:
+    """State of the local tracker after each report, moved with the measurement that it was made from."""
+    mean, turn = r.mean.copy(), r.turn
+    mean[:, :3:2] += r.shift
     c, s = np.cos(turn), np.sin(turn)
     vx, vy = mean[:, 1].copy(), mean[:, 3].copy()
     mean[:, 1], mean[:, 3] = c * vx - s * vy, s * vx + c * vy
-    return mean, moments.cov[row]
-
-
-def _reframed(lanes: Lanes, scene: _Scene) -> tuple[_Array, _Array]:
-    """Return how far the frame of a track moves before each report (n, 2), m, and turns (n,), rad.
-
-    It does where what is known of a system's biases has stepped further than the noise of its reports. No target moved
-    there: a track that this system sees alone moves with the new frame. Where another system sees it, too, the state is
-    in that one's frame already.
-    """
-    m, owner = scene.m, scene.owner[lanes.number]
-    shift, turn = np.zeros((len(owner), 2)), np.zeros(len(owner))
-    usable = (lanes.row >= 0) & np.isfinite(m.position[lanes.number, 0])
-    for k, part in enumerate(scene.parts):
-        at = np.flatnonzero(usable & (owner == k))
-        if part.registered.found is None or not len(at):
-            continue
-        series = part.registered.found.series
-        other = latest(np.where(owner == k, -1, np.arange(len(owner))), lanes.track)
-        met = np.where(other >= 0, scene.time[lanes.number[other]], -np.inf)
-        again = np.flatnonzero(~is_first(lanes.track[at]))
-        index, before = lanes.number[at[again]], lanes.number[at[again - 1]]
-        since_then = scene.time[before], scene.time[index]
-        step = learnt(series, m.ray[index], scene.velocity[index], *since_then)
-        d2 = np.einsum("ni,nij,nj->n", step, np.linalg.inv(m.cov[index, :2, :2]), step)
-        moves = (d2 > _STEP**2) & (since_then[1] - met[at[again]] > _LATELY)
-        shift[at[again[moves]]] = step[moves]
-        azimuth = [series.at(time[moves])[0][:, 2] for time in since_then]
-        turn[at[again[moves]]] = azimuth[1] - azimuth[0]
-    return shift, turn
-
-
-def _echoing(lanes: Lanes, time: _Array, segments: Segments, parts: Sequence[Part]) -> _Mask:
-    """Say which rows are second echoes."""
-    system = np.repeat(np.arange(len(parts)), [len(p.system.ids) for p in parts])
-    own = np.flatnonzero(segments.track < len(system))  # another centre's tracks, numbered last, have no measurements
-    out = np.zeros(len(lanes.number), bool)
-    for spell in second_echoes(Segments(*(column[own] for column in segments)), system):
-        when = time[lanes.number]
-        out |= (lanes.local == spell.track) & (when >= spell.time_from) & (when < spell.time_to)
-    return out
-
-
-def _assigned(
-    parts: Sequence[Part], place: Sequence[_Index], of: _Index, conditions: Sequence[SourceCondition]
-) -> Assignments:
-    """What became of every measurement; local tracks never confirmed get numbers behind those of system tracks."""
-    track_id, n = of.copy(), len(of)
-    split, elsewhere = np.zeros(n, bool), np.zeros(n, bool)
-    above = int(of.max(initial=0))
-    for part, at in zip(parts, place, strict=True):
-        split[at], elsewhere[at] = part.found.split, part.found.elsewhere
-        rest = (of[at] == 0) & (part.found.track_id > 0)
-        track_id[at[rest]] = above + part.found.track_id[rest]
-        above += int(part.found.track_id.max(initial=0))
-    told = [ConditionFound(c.law, c.history) for c in conditions]
-    return Assignments(track_id, split, elsewhere, np.unique(of[of > 0]), told)
+    return mean, r.cov
