@@ -91,6 +91,12 @@ def test_tables_are_known_by_name(tmp_path):
         ('[filter]\naccel_h = "fast"', r"\[filter\] accel_h = 'fast'"),
         ('[filter]\nform = "triangular"', r"\[filter\] form = 'triangular'"),
         ("[filter]\nzzz = 1", "unknown key 'zzz'. Known are: form"),
+        ("[intake]\nhold = -1.0", r"c\.toml: intake\.hold is a time in s"),
+        ("[intake]\nfor_good = 0", r"intake\.for_good is a number of reports"),
+        ("[setup]\nlongest = 0.5", r"setup\.longest is a number of times, 1 or more"),
+        ("[periods]\nshortest = 30.0", r"periods\.shortest 30\.0 s must be below periods\.longest 20\.0 s"),
+        ("[periods]\nshare = 1.5", r"periods\.width and periods\.share are shares"),
+        ("[systems]\nsilent = 0.0", r"systems\.silent must be positive"),
         ("tracker = 3", r"make it a table \[tracker\]"),
     ],
 )

@@ -20,7 +20,8 @@ from saltus.report.settings import UNITS, readable
 from saltus.report.updates import groups, read_updates
 from saltus.tracks.health import Degraded, Health
 from saltus.tracks.registration import RegistrationSettings
-from saltus.tracks.settings import FilterSettings, SetupSettings, SystemsSettings, TrackerSettings
+from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
+from saltus.tracks.setup_settings import IntakeSettings, PeriodSettings, SetupSettings
 
 T0 = 1_700_000_000.0
 SITE = Site(np.radians(41.3), np.radians(2.1), 27.3, 0.0)
@@ -406,6 +407,7 @@ def test_the_plane_is_said_in_short():
 def test_run_has_dates_and_units(tmp_path):
     kinds = {"tracker": TrackerSettings, "filter": FilterSettings, "systems": SystemsSettings}
     kinds |= {"registration": RegistrationSettings, "setup": SetupSettings}
+    kinds |= {"intake": IntakeSettings, "periods": PeriodSettings}
     for group, units in UNITS.items():
         assert set(units) <= {field.name for field in fields(kinds[group])}
     chosen = {"tracker": {"max_speed": 400.0, "coast_seconds": 20.0}, "filter": {"accel_h": (0.15, 3.0)}}

@@ -27,7 +27,9 @@ system = "platform"               # optional: sources of one system make common 
 
 [learnt]                          # written by saltus setup: what was learnt from reports
 [reading]                         # fields of saltus.io.ReadingSettings
-[setup]                           # fields of saltus.tracks.settings.SetupSettings
+[intake]                          # fields of saltus.tracks.setup_settings.IntakeSettings
+[setup]                           # fields of saltus.tracks.setup_settings.SetupSettings
+[periods]                         # fields of saltus.tracks.setup_settings.PeriodSettings
 [tracker]                         # fields of saltus.tracks.settings.TrackerSettings
 [filter]                          # fields of saltus.tracks.settings.FilterSettings
 [systems]                         # fields of saltus.tracks.settings.SystemsSettings
@@ -40,7 +42,7 @@ import difflib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar, cast, get_type_hints
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
@@ -53,7 +55,8 @@ from saltus.io.told import Progress
 from saltus.records import Recording, System
 from saltus.text import brief, cut, shown
 from saltus.toml import load_toml
-from saltus.tracks.settings import FilterSettings, RegistrationSettings, SetupSettings, SystemsSettings, TrackerSettings
+from saltus.tracks.settings import FilterSettings, RegistrationSettings, SystemsSettings, TrackerSettings
+from saltus.tracks.setup_settings import IntakeSettings, PeriodSettings, SetupSettings
 
 if TYPE_CHECKING:
     from saltus.io.in_order import InOrder
@@ -84,8 +87,17 @@ _HINTS = {
 }
 
 _YEARS = 1970, 2100  # of a recording: times count from the first, reports after the last are out of range
-_Settings = ReadingSettings | SetupSettings | TrackerSettings | FilterSettings | SystemsSettings | RegistrationSettings
-T = TypeVar("T", bound=_Settings)
+_TABLES: dict[str, type[Any]] = {
+    "reading": ReadingSettings,
+    "intake": IntakeSettings,
+    "setup": SetupSettings,
+    "periods": PeriodSettings,
+    "tracker": TrackerSettings,
+    "filter": FilterSettings,
+    "systems": SystemsSettings,
+    "registration": RegistrationSettings,
+}
+T = TypeVar("T")
 _Read = TypeVar("_Read", Recording, "InOrder")
 _Octet = Annotated[int, Field(ge=0, le=255)]
 _Sigma = Annotated[float, Field(gt=0.0, le=1e4)]
@@ -156,7 +168,9 @@ class Config(BaseModel):
     sensor: tuple[SensorConfig, ...] = ()
     editions: dict[int, str] = Field(default_factory=dict)
     reading: ReadingSettings = Field(default_factory=ReadingSettings)
+    intake: IntakeSettings = Field(default_factory=IntakeSettings)
     setup: SetupSettings = Field(default_factory=SetupSettings)
+    periods: PeriodSettings = Field(default_factory=PeriodSettings)
     tracker: TrackerSettings = Field(default_factory=TrackerSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
     systems: SystemsSettings = Field(default_factory=SystemsSettings)
@@ -216,12 +230,7 @@ def _load(path: Path | str) -> Config:
     content = load_toml(path)
     _known(path, "", content, Config.model_fields)
     values: dict[str, object] = {
-        "reading": _settings(path, "reading", content.get("reading", {}), ReadingSettings),
-        "setup": _settings(path, "setup", content.get("setup", {}), SetupSettings),
-        "tracker": _settings(path, "tracker", content.get("tracker", {}), TrackerSettings),
-        "filter": _settings(path, "filter", content.get("filter", {}), FilterSettings),
-        "systems": _settings(path, "systems", content.get("systems", {}), SystemsSettings),
-        "registration": _settings(path, "registration", content.get("registration", {}), RegistrationSettings),
+        **{name: _settings(path, name, content.get(name, {}), kind) for name, kind in _TABLES.items()},
         "sensor": _sensors(path, content.get("sensor", [])),
         "editions": _editions(path, content.get("editions", {})),
     }
@@ -336,7 +345,7 @@ def _settings(path: Path | str, name: str, table: object, kind: type[T]) -> T:
     """Make settings from a table, each value checked against the type of its field."""
     if not isinstance(table, Mapping):
         raise ModelError(f"{path}: {name} = {brief(table)}: make it a table [{name}].")
-    fields = [f.name for f in dataclasses.fields(kind)]
+    fields = [f.name for f in dataclasses.fields(cast(Any, kind))]
     _known(path, f"[{name}]", table, fields)
     types = get_type_hints(kind)
     values = {}

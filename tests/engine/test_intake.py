@@ -10,7 +10,7 @@ from saltus.engine.arrays import flattened, from_table, nested, to_table
 from saltus.engine.intake import Intake
 from saltus.engine.stretch import Stretch
 from saltus.records import REASONS, Plots, Source, System
-from saltus.tracks.settings import SetupSettings
+from saltus.tracks.setup_settings import IntakeSettings, SetupSettings
 
 SOURCES = tuple(Source(System(None, None, None, name)) for name in "abc")
 LATE, JUMP = REASONS.index("out of order"), REASONS.index("clock jump")
@@ -40,23 +40,35 @@ def test_reports_are_let_go_in_order_of_time(rng):
     time = np.arange(300) * 0.1
     arrival = np.argsort(time + rng.uniform(0.0, 1.9, 300), kind="stable")
     plots = reports(time[arrival])
-    whole = through(Intake(2.0), plots, [])
+    whole = through(Intake(IntakeSettings()), plots, [])
     assert whole[1] == sorted(time.tolist()) and not whole[2]
     for cuts in ([150], list(range(1, 300)), sorted(rng.choice(299, 20, replace=False) + 1)):
-        assert through(Intake(2.0), plots, cuts) == whole
+        assert through(Intake(IntakeSettings()), plots, cuts) == whole
 
 
 def test_what_comes_later_than_the_hold_is_out_of_order():
     """At 10 s, reports of 7.9 s are too late and those of 8.1 s are not."""
-    number, time, refused = through(Intake(2.0), reports([0.0, 10.0, 8.1, 7.9, 11.0]), [])
+    number, time, refused = through(Intake(IntakeSettings()), reports([0.0, 10.0, 8.1, 7.9, 11.0]), [])
     assert time == [0.0, 8.1, 10.0, 11.0] and number == [0, 2, 1, 4]
     assert refused == {3: LATE}
+
+
+def test_the_hold_and_what_a_leap_is_are_settings():
+    time = [0.0, 10.0, 8.1, 7.9, *np.arange(100.0, 104.0)]
+    patient = IntakeSettings(hold=3.0, wild=200.0)
+    assert through(Intake(patient), reports(time), [])[1:] == (sorted(time), {})
+    quick = IntakeSettings(wild=50.0, for_good=4)
+    _number, out, refused = through(Intake(quick), reports(time), [])
+    assert refused == {3: LATE} and out[-4:] == [100.0, 101.0, 102.0, 103.0]
+    slow = Intake(IntakeSettings(wild=50.0, for_good=5))
+    assert slow.add(reports([0.0]), np.array([0])) is not None
+    assert not len(slow.add(reports(time[4:]), np.arange(1, 5)).plots)  # in doubt: a fifth would settle it
 
 
 @pytest.mark.parametrize("cuts", [[], [15], list(range(1, 43))])
 def test_one_wild_time_is_a_jump_and_a_clock_that_leaps_for_good_is_followed(cuts):
     time = [*np.arange(20.0), 5000.0, *np.arange(20.0, 24.0), *np.arange(900.0, 918.0)]
-    intake = Intake(2.0)
+    intake = Intake(IntakeSettings())
     _, out, refused = through(intake, reports(time), cuts)
     assert refused == {20: JUMP}
     assert out == [*np.arange(24.0), *np.arange(900.0, 918.0)]
@@ -70,7 +82,7 @@ def test_a_clock_that_leaps_while_others_go_on_is_not_followed(cuts):
     time = np.repeat(np.arange(30.0), 2) + np.tile([0.0, 0.5], 30)
     source = np.tile([0, 1], 30)
     time[(source == 1) & (time > 10)] += 3600.0
-    intake = Intake(2.0)
+    intake = Intake(IntakeSettings())
     _, out, refused = through(intake, reports(time, source), cuts)
     assert set(refused) == set(np.flatnonzero(time > 3000).tolist()) and set(refused.values()) == {JUMP}
     assert out == np.sort(time[time < 3000]).tolist()
@@ -80,12 +92,12 @@ def test_a_clock_that_leaps_while_others_go_on_is_not_followed(cuts):
 def test_an_intake_restored_goes_on(rng):
     time = np.concatenate([np.arange(30.0) + rng.uniform(0, 1.5, 30), np.arange(900.0, 920.0)])
     plots = reports(time)
-    whole = through(Intake(2.0), plots, [])
+    whole = through(Intake(IntakeSettings()), plots, [])
     for cut in (7, 29, 35, 44):
-        first = Intake(2.0)
+        first = Intake(IntakeSettings())
         told = first.add(plots.take(slice(0, cut)), np.arange(cut))
         state = nested(dict(flattened(copy.deepcopy(first.state()))))
-        second = Intake(2.0)
+        second = Intake(IntakeSettings())
         second.restore(state, plots)
         rest = [second.add(plots.take(slice(cut, None)), np.arange(cut, len(plots))), second.end(plots)]
         assert [*told.number, *rest[0].number, *rest[1].number] == whole[0]

@@ -7,13 +7,12 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.records import REASONS, Plots, Source
+from saltus.tracks.setup_settings import IntakeSettings
 
 __all__ = ["Arrived", "Intake", "Leap", "joined_plots", "numbered"]
 
 _Index = npt.NDArray[np.int64]
 
-_WILD = 60.0  # s: a report so far ahead of all before has a clock that leapt, or there was a gap
-_FOR_GOOD = 10  # reports of one source at the new time that make it the time
 _LATE, _JUMP = REASONS.index("out of order"), REASONS.index("clock jump")
 
 
@@ -60,14 +59,14 @@ class Intake:
     """Holds reports back until none is to be expected before them.
 
     A report is let go when one `hold` seconds later has come; one that is then still older is out of order. A report
-    more than a minute ahead of all before is in doubt until ten of its source agree: then time goes on from there,
+    `wild` seconds ahead of all before is in doubt until `for_good` of its source agree: then time goes on from there,
     unless another source meanwhile reported at the old time. Every report is judged by those that came before it, so
     it does not matter in which pieces they come.
     """
 
-    def __init__(self, hold: float) -> None:
-        """Hold back for so many seconds; 0: reports come in order, and a gap is no leap of a clock."""
-        self._hold, self._newest = hold, -np.inf
+    def __init__(self, settings: IntakeSettings) -> None:
+        """Begin with nothing held."""
+        self._hold, self._settings, self._newest = settings.hold, settings, -np.inf
         self._held: list[tuple[Plots, _Index]] = []
         self._doubted: dict[int, list[tuple[Plots, int, float]]] = {}  # by source: report, number, time
         self._contradicted: set[int] = set()  # sources in doubt while another reports at the old time
@@ -78,7 +77,9 @@ class Intake:
         """Take usable reports in order of arrival."""
         before = np.maximum.accumulate(np.append(self._newest, plots.time))
         ahead = plots.time - before[:-1]
-        calm = self._hold == 0.0 or (not self._doubted and bool((ahead[np.isfinite(ahead)] <= _WILD).all()))
+        calm = self._hold == 0.0 or (
+            not self._doubted and bool((ahead[np.isfinite(ahead)] <= self._settings.wild).all())
+        )
         if calm:
             late = plots.time < before[:-1] - self._hold
             self._refused += [(int(k), _LATE) for k in number[late]]
@@ -98,13 +99,13 @@ class Intake:
     def _judge(self, one: Plots, number: int) -> None:
         """Judge a report where a clock is in doubt."""
         time, source = float(one.time[0]), int(one.source[0])
-        if np.isfinite(self._newest) and time > self._newest + _WILD:
+        if np.isfinite(self._newest) and time > self._newest + self._settings.wild:
             doubted = self._doubted.setdefault(source, [])
-            if doubted and abs(time - doubted[-1][2]) > _WILD:
+            if doubted and abs(time - doubted[-1][2]) > self._settings.wild:
                 self._refuse(source)
                 doubted = self._doubted.setdefault(source, [])
             doubted.append((one, number, time))
-            if len(doubted) >= _FOR_GOOD:
+            if len(doubted) >= self._settings.for_good:
                 self._settle(source)
             return
         if source in self._doubted:

@@ -121,7 +121,7 @@ def _period(
     at = at[np.isfinite(m.position[at, 0])]
     if np.isnan(period) and len(at):
         sigma = np.sqrt(0.5 * (m.cov[at, 0, 0] + m.cov[at, 1, 1]))
-        period = learn_period(m.time[at], m.position[at, :2], sigma, config.tracker.max_speed)
+        period = learn_period(m.time[at], m.position[at, :2], sigma, config.tracker.max_speed, config.periods)
     return float(period) if period > 0 else float("nan")
 
 

@@ -35,7 +35,6 @@ __all__ = ["Published", "Session"]
 
 _Index = npt.NDArray[np.int64]
 
-_HOLD = 2.0  # s that reports may come late
 _NOTED = ("time", "source", "file", "record", "local_id", "reason")  # of a report, in the journal
 
 
@@ -54,12 +53,12 @@ class Session:
     _vetting: Vetting | None
     _live: Live | None  # of several systems
 
-    def __init__(self, setup: Setup, *, hold: float = _HOLD, folder: Path | None = None) -> None:
+    def __init__(self, setup: Setup, *, hold: float | None = None, folder: Path | None = None) -> None:
         """Begin with a setup.
 
         Args:
             setup: of the sources.
-            hold: s that a report may come late; 0: reports come in order of time.
+            hold: s that a report may come late; 0: reports come in order of time; None: as configured.
             folder: of the journal; None: a temporary one.
         """
         self._begin(setup.config, setup.use_identity, {}, hold, folder, Progress())
@@ -72,7 +71,7 @@ class Session:
         *,
         use_identity: bool = True,
         periods: Mapping[str, float] | None = None,
-        hold: float = _HOLD,
+        hold: float | None = None,
         folder: Path | None = None,
         bar: Progress | None = None,
         running: bool = True,
@@ -84,7 +83,7 @@ class Session:
                 setup, and nothing is learnt.
             use_identity: whether addresses and codes count.
             periods: update period of each source that its reader tells, by designation, s.
-            hold: s that a report may come late; 0: reports come in order of time.
+            hold: s that a report may come late; 0: reports come in order of time; None: as configured.
             folder: of the journal; None: a temporary one.
             bar: shows progress.
             running: whether `feed` tells of several systems which tracks are one; `finish` does in any case.
@@ -110,17 +109,18 @@ class Session:
         config: Config,
         use_identity: bool,
         periods: Mapping[str, float],
-        hold: float,
+        hold: float | None,
         folder: Path | None,
         bar: Progress,
     ) -> None:
-        self._config, self._use_identity, self._hold = config, use_identity, hold
+        self._config, self._use_identity = config, use_identity
         self._periods = dict(periods)
         self._bar, self._journal = bar, Journal(folder)
         self._sources: list[Source] = []
         self._files: list[str] = []
         self._n = 0
-        self._intake, self._stretch = Intake(hold), Stretch(config.setup)
+        self._hold = config.intake.hold if hold is None else hold
+        self._intake, self._stretch = Intake(replace(config.intake, hold=self._hold)), Stretch(config.setup)
         self._setups: list[Setup] = []
         self._locals: dict[int, LocalTracking] = {}  # by the first source of each system
         self._news = News()

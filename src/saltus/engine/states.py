@@ -85,6 +85,7 @@ class FusedStates:
             [plot_law(config.tracker, sensor.kind) for sensor in setup.sensors],
             config.filter,
             config.tracker,
+            config.systems,
             [sensor.wait for sensor in setup.sensors],
             use_identity=setup.use_identity,
         )

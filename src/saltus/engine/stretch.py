@@ -8,15 +8,11 @@ import numpy.typing as npt
 
 from saltus.engine.intake import joined_plots
 from saltus.records import Plots
-from saltus.tracks.settings import SetupSettings
+from saltus.tracks.setup_settings import SetupSettings
 
 __all__ = ["Stretch"]
 
 _Index = npt.NDArray[np.int64]
-
-
-_GAP = 60.0  # s: longer without a report counts as so much
-_LONGEST = 6.0  # times as long as asked, where sources report seldom
 
 
 class Stretch:
@@ -40,13 +36,13 @@ class Stretch:
             return 1
         settings = self._settings
         gaps = np.diff(plots.time, prepend=min(self._last, float(plots.time[0])))
-        heard = np.cumsum(np.append(self._heard, np.minimum(gaps, _GAP)))[1:]  # one by one, whatever the pieces
+        heard = np.cumsum(np.append(self._heard, np.minimum(gaps, settings.gap)))[1:]  # one by one, whatever the pieces
         size = max(len(self._count), int(plots.source.max()) + 1)
         seen = np.zeros((len(plots), size), np.int64)
         seen[np.arange(len(plots)), plots.source] = 1
         count = np.cumsum(seen, axis=0) + np.pad(self._count, (0, size - len(self._count)))
         many, some = (((count >= n) | (count == 0)).all(axis=1) for n in (settings.reports, settings.fewest))
-        enough = many | (some & (heard >= settings.seconds)) | (heard >= _LONGEST * settings.seconds)
+        enough = many | (some & (heard >= settings.seconds)) | (heard >= settings.longest * settings.seconds)
         stop = int(enough.argmax()) + 1 if enough.any() else len(plots) + 1
         taken = min(stop, len(plots))
         self._plots.append(plots.take(slice(0, taken)))

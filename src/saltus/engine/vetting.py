@@ -14,14 +14,12 @@ __all__ = ["Vetting"]
 
 _Array = npt.NDArray[np.float64]
 
-_REPORTS = 1_000  # usable ones that are judged
-_FAR = 1e6  # m from the middle of the plane: another place
 _EARTH = 6.371e6  # m
 _LEARN = "Learn one from these reports with saltus setup."
 
 
 class Vetting:
-    """Judges by the first thousand usable reports, whatever the pieces in which they come."""
+    """Judges by the first usable reports (`SetupSettings.vetted`), whatever the pieces in which they come."""
 
     def __init__(self, state: Mapping[str, Any] | None = None) -> None:
         """Begin without a report, or go on from what `state` gave."""
@@ -40,10 +38,11 @@ class Vetting:
         Raises:
             DataError: none of the reports' sources is in the setup, or they lie elsewhere.
         """
+        wanted = setup.config.setup.vetted
         place = np.column_stack([plots.latitude, plots.longitude])
-        self._source = np.concatenate([self._source, plots.source])[:_REPORTS]
-        self._place = np.concatenate([self._place, place])[:_REPORTS]
-        if len(self._source) < (1 if last else _REPORTS):
+        self._source = np.concatenate([self._source, plots.source])[:wanted]
+        self._place = np.concatenate([self._place, place])[:wanted]
+        if len(self._source) < (1 if last else wanted):
             return last
         known = [s.source.system for s in setup.sensors]
         found = np.unique(self._source)
@@ -64,7 +63,7 @@ class Vetting:
         there = np.median(_directions(places), axis=0)
         middle = _directions(np.array([[setup.plane.latitude, setup.plane.longitude]]))[0]
         away = _EARTH * float(np.arctan2(np.linalg.norm(np.cross(there, middle)), there @ middle))
-        if away > _FAR:
+        if away > setup.config.setup.far:
             raise DataError(f"the setup is one of another place, {away / 1000:.0f} km from the reports. {_LEARN}")
 
     def state(self) -> dict[str, Any]:

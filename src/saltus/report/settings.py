@@ -7,7 +7,9 @@ __all__ = ["UNITS", "readable"]
 
 # Units of the settings whose names carry none, as endings that `title` writes out.
 UNITS: dict[str, dict[str, str]] = {
-    "setup": {"seconds": "s"},
+    "intake": {"hold": "s", "wild": "s"},
+    "setup": {"seconds": "s", "gap": "s", "far": "m"},
+    "periods": {"shortest": "s", "longest": "s", "accel": "mps2"},
     "tracker": {
         "clutter_density": "perm2",
         "clutter_density_azimuth": "perrad",
@@ -40,6 +42,9 @@ UNITS: dict[str, dict[str, str]] = {
         "speed": "mps",
         "track_sigma": "m",
         "track_memory": "s",
+        "silent": "s",
+        "rows_kept": "s",
+        "lately": "s",
     },
     "registration": {
         "sigma_offset": "m",

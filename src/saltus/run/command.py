@@ -124,7 +124,10 @@ def write_tracks(
     summary, names = _summary(inputs, result, [*left_out(inputs), *seen.problems, *lines], seen), called(result.setup)
     summary["settings"] = {
         "identity": given.identity,
-        **{name: asdict(getattr(config, name)) for name in ("setup", "tracker", "filter", "systems", "registration")},
+        **{
+            name: asdict(getattr(config, name))
+            for name in ("intake", "setup", "periods", "tracker", "filter", "systems", "registration")
+        },
     }
     summary["seconds"] = {
         "decoding": round(reading.seconds, 2),

@@ -27,10 +27,6 @@ __all__ = ["Picture", "decision_settings"]
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
 
-_KEPT = 90.0  # s of rows beyond `registration.interval` that registration may still need
-_SILENT = 60.0  # s without a report after which a local track counts as ended, until it reports again
-_LEAST = 2.0  # tracks at a time, of which a partner could be any
-
 
 def decision_settings(settings: SystemsSettings) -> DecisionSettings:
     """Return when tracks are declared one object."""
@@ -92,7 +88,7 @@ class Picture:
     @property
     def kept(self) -> float:
         """S of rows that a look needs."""
-        return max(self._settings.window, 8.0 * max(self._periods), self._expected.interval + _KEPT)
+        return max(self._settings.window, 8.0 * max(self._periods), self._expected.interval + self._settings.rows_kept)
 
     def news(self) -> tuple[Segments, list[Merger]]:
         """Take what the last look found about the numbers of local tracks."""
@@ -140,7 +136,7 @@ class Picture:
     @property
     def prior(self) -> float:
         """Probability that a pair is one object: any track that a system has at a time could be the one."""
-        return 1.0 / max(_LEAST, self._alive / max(self._looks, 1))
+        return 1.0 / max(self._settings.rivals, self._alive / max(self._looks, 1))
 
     def _heard(self, k: int, system: LocalSystem, now: float) -> None:
         """Count what new rows of a system say; a track that is confirmed now brings all it has."""
@@ -169,7 +165,9 @@ class Picture:
         born = [
             (float(ready), k, int(own), place)
             for k, system in enumerate(systems)
-            for place in np.flatnonzero((system.ready > self._before - _SILENT) & (system.ready <= now)).tolist()
+            for place in np.flatnonzero(
+                (system.ready > self._before - self._settings.silent) & (system.ready <= now)
+            ).tolist()
             for ready, own in [(system.ready[place], int(system.ids[place]))]
             if np.isfinite(ready) and (k, own) not in self.number
         ]
@@ -213,7 +211,7 @@ class Picture:
     def _decide(self, now: float, said: Looked) -> None:
         """Decide, and join and part tracks."""
         of, last = np.array(self._of, np.int64), np.array(self._last)
-        alive = last >= now - _SILENT
+        alive = last >= now - self._settings.silent
         self._looks += 1
         self._alive += int(np.bincount(of[alive], minlength=1).max(initial=0))
         decided = self._decider.update(
@@ -231,7 +229,7 @@ class Picture:
         self._said.append(said)
         self._ended.append(decided.ended)
         members = self.membership
-        for g in np.flatnonzero(~alive & (last >= self._before - _SILENT)).tolist():
+        for g in np.flatnonzero(~alive & (last >= self._before - self._settings.silent)).tolist():
             members.death(g, float(last[g]))
         ended = Episodes._make(column[decided.parted] for column in decided.ended)
         for e in _rows(ended):

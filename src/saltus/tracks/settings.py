@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from saltus.errors import ModelError
 
-__all__ = ["FilterSettings", "RegistrationSettings", "SetupSettings", "SystemsSettings", "TrackerSettings"]
+__all__ = ["FilterSettings", "RegistrationSettings", "SystemsSettings", "TrackerSettings"]
 
 _FASTEST_TURN = 45.0  # degrees/s: faster, a turn is a circle between two plots
 
@@ -185,6 +185,11 @@ class SystemsSettings:
         speed: standard deviation of each component of an object's velocity, m/s.
         track_sigma: standard deviation of positions in another centre's tracks (CAT062), each axis, m.
         track_memory: time constant of that centre's filter, s.
+        silent: s without a report after which a local track counts as ended, until it reports again.
+        rows_kept: s of reports, beyond `registration.interval`, that a look may still need.
+        rivals: tracks at a time, at least, of which a partner could be any.
+        lately: s within which another system must have seen a target for its frame to hold.
+        step: standard deviations of a report by which a correction steps, from which a state is moved with it.
     """
 
     reference: str = ""
@@ -199,6 +204,11 @@ class SystemsSettings:
     speed: float = 100.0
     track_sigma: float = 50.0
     track_memory: float = 10.0
+    silent: float = 60.0
+    rows_kept: float = 90.0
+    rivals: float = 2.0
+    lately: float = 30.0
+    step: float = 2.0
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""
@@ -215,6 +225,11 @@ class SystemsSettings:
             "speed",
             "track_sigma",
             "track_memory",
+            "silent",
+            "rows_kept",
+            "rivals",
+            "lately",
+            "step",
         ):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ModelError(f"systems.{name} must be positive and finite, got {getattr(self, name)}.")
@@ -263,33 +278,3 @@ class RegistrationSettings:
         azimuth = float(np.radians(self.sigma_azimuth))
         offset = self.sigma_offset
         return np.array([offset, offset, azimuth, self.sigma_range, self.sigma_range_scale, self.sigma_time])
-
-
-@dataclass(frozen=True, slots=True)
-class SetupSettings:
-    """The first stretch of reports, from which noise, update periods and backgrounds are learnt.
-
-    It ends when every source present gave `reports` of them, or after `seconds` if each gave `fewest`, and after six
-    times `seconds` at the latest. Of a gap in the data one minute counts. Then the stretch is tracked; until then
-    nothing is published.
-
-    Attributes:
-        reports: of each source.
-        seconds: of data.
-        fewest: reports of each source from which something can be learnt.
-        estimated: first reports of a source whose noise is configured, or that appeared later, from which its noise is
-            estimated after the end, to be told.
-    """
-
-    reports: int = 5_000
-    seconds: float = 600.0
-    fewest: int = 500
-    estimated: int = 100_000
-
-    def __post_init__(self) -> None:
-        """Refuse settings that cannot be."""
-        for name in ("reports", "fewest", "estimated"):
-            if not getattr(self, name) >= 1:
-                raise ModelError(f"setup.{name} is a number of reports, 1 or more, got {getattr(self, name)}.")
-        if not 0.0 < self.seconds < np.inf:
-            raise ModelError(f"setup.seconds must be positive and finite, got {self.seconds}.")

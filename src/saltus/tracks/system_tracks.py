@@ -14,7 +14,7 @@ from saltus.tracks.lifecycle import CONFIRMED
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.membership import Segments
 from saltus.tracks.rows import Rows, join_rows
-from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
 from saltus.tracks.slices import slices
 from saltus.tracks.splits import second_echoes
 from saltus.tracks.systems import Registered, lasting_differences
@@ -27,8 +27,6 @@ _Index = npt.NDArray[np.int64]
 _Mask = npt.NDArray[np.bool_]
 
 _LONGEST = 4.0  # s that a slice lasts
-_LATELY = 30.0  # s within which another system must have seen a target for its frame to hold
-_STEP = 2.0  # standard deviations of a report by which a correction steps, from which a state is moved with it
 
 
 class Fused(NamedTuple):
@@ -93,6 +91,7 @@ class SystemTracking:
         laws: Sequence[PlotLaw],
         filters: FilterSettings,
         settings: TrackerSettings,
+        systems: SystemsSettings,
         periods: Sequence[float],
         *,
         use_identity: bool,
@@ -106,6 +105,7 @@ class SystemTracking:
             laws: what may be wrong with reports of each source.
             filters: manoeuvres.
             settings: faults, coasting.
+            systems: when the frame of a track moves.
             periods: s without a report after which a target counts as missed, of each source.
             use_identity: whether tracks take over addresses and codes.
         """
@@ -119,7 +119,7 @@ class SystemTracking:
         late = [r.found.series.mean[:, 5].max(initial=0.0) for r in registered if r.found is not None]
         self._late = float(max(late, default=0.0))
         self._pending: list[list[_Corrected]] = [[] for _ in ids]  # others may still come before
-        self._lanes = _Lanes(np.unique(segments.system_track), registered)
+        self._lanes = _Lanes(np.unique(segments.system_track), registered, systems)
         self._waiting: tuple[Measurements, Candidates] | None = None  # of slices that are not complete
         self._before = -np.inf  # s: time of the last report of the slices complete
 
@@ -207,10 +207,10 @@ class SystemTracking:
 class _Lanes:
     """What is known of each system track so far: which systems saw it, when, and whether it is confirmed."""
 
-    def __init__(self, tracks: _Index, registered: Sequence[Registered]) -> None:
+    def __init__(self, tracks: _Index, registered: Sequence[Registered], settings: SystemsSettings) -> None:
         """Begin with nothing known of system tracks, sorted by number."""
         n = len(tracks)
-        self._tracks, self._registered = tracks, registered
+        self._tracks, self._registered, self._settings = tracks, registered, settings
         self._owner = np.full(n, -1)  # system of the first report
         self._several, self._sure = np.zeros(n, bool), np.zeros(n, bool)
         self._n = 0  # reports so far
@@ -253,8 +253,11 @@ class _Lanes:
             before[again] = r.time[at[np.flatnonzero(again) - 1]]
             there = np.isfinite(before)
             at, before = at[there], before[there]
-            moved, turned = _stepped(registered.found.series, r, at, before, r.time[at] - self._met(r, lane, k)[at])
-            shift[at], turn[at] = moved, turned
+            alone = r.time[at] - self._met(r, lane, k)[at]
+            step, turned = _stepped(registered.found.series, r, at, before)
+            d2 = np.einsum("ni,nij,nj->n", step, np.linalg.inv(r.m.cov[at, :2, :2]), step)
+            moves = (d2 > self._settings.step**2) & (alone > self._settings.lately)
+            shift[at[moves]], turn[at[moves]] = step[moves], turned[moves]
         return shift, turn
 
     def _met(self, r: _Corrected, lane: _Index, k: int) -> _Array:
@@ -278,7 +281,7 @@ class _Lanes:
         self._n += len(lane)
 
 
-def _stepped(series: BiasSeries, r: _Corrected, at: _Index, before: _Array, alone: _Array) -> tuple[_Array, _Array]:
+def _stepped(series: BiasSeries, r: _Corrected, at: _Index, before: _Array) -> tuple[_Array, _Array]:
     """Return how far, and by which angle, the frame of one system's reports stepped since the ones before them.
 
     Args:
@@ -286,14 +289,10 @@ def _stepped(series: BiasSeries, r: _Corrected, at: _Index, before: _Array, alon
         r: reports.
         at: those of the system, (k,).
         before: times of the ones before, s.
-        alone: s since another system saw the track.
     """
-    now, velocity = r.time[at], r.velocity[at]
-    step = learnt(series, r.m.ray[at], velocity, before, now)
-    d2 = np.einsum("ni,nij,nj->n", step, np.linalg.inv(r.m.cov[at, :2, :2]), step)
-    moves = (d2 > _STEP**2) & (alone > _LATELY)
+    now = r.time[at]
     azimuth = [series.at(time)[0][:, 2] for time in (before, now)]
-    return np.where(moves[:, None], step, 0.0), np.where(moves, azimuth[1] - azimuth[0], 0.0)
+    return learnt(series, r.m.ray[at], r.velocity[at], before, now), azimuth[1] - azimuth[0]
 
 
 def _state(r: _Corrected) -> tuple[_Array, _Array]:
