@@ -76,6 +76,7 @@ class Identified:
     decisions: Decisions
     evidence: Evidence
     apart: Mapping[tuple[int, int, int], float]  # m between two systems' positions of one address: median
+    told_every: int = 1  # of so many looks `evidence` tells one
 
 
 def identify(journal: Journal, setup: Setup, told: Tally) -> Identified:
@@ -255,6 +256,7 @@ def _found(systems: list[SystemNames], picture: Picture, apart: Mapping[tuple[in
         ),
         evidence._replace(pairs=number[evidence.pairs]),
         apart,
+        picture.told_every,
     )
 
 

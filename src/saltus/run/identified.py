@@ -1,6 +1,7 @@
 """What a run found of identity and biases, as tables and lines: identifications.parquet, biases.json, the report."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,7 @@ def systems_found(whole: Identified, settings: SystemsSettings, titles: Mapping[
     if len(whole.systems) < 2:
         return None
     published = np.isin(whole.segments.system_track, published_tracks(whole))
+    rule = decision_settings(settings)
     return SystemsFound(
         names=tuple(x.name for x in whole.systems),
         titles=tuple(titles.get(x.name, x.name) for x in whole.systems),
@@ -122,6 +124,6 @@ def systems_found(whole: Identified, settings: SystemsSettings, titles: Mapping[
         segments=Segments(*(column[published] for column in whole.segments)),
         decisions=whole.decisions,
         evidence=whole.evidence,
-        rule=decision_settings(settings),
+        rule=replace(rule, hold=rule.hold * whole.told_every),
         biases=bias_tables(whole),
     )

@@ -21,6 +21,7 @@ from saltus.tracks.local import LocalSystem
 from saltus.tracks.membership import Local, Membership, Merger, Segments
 from saltus.tracks.settings import FilterSettings, RegistrationSettings, SystemsSettings
 from saltus.tracks.systems import Frames, Region, Registered
+from saltus.tracks.told import Told
 
 __all__ = ["Picture", "decision_settings"]
 
@@ -77,7 +78,7 @@ class Picture:
         self._codes: list[tuple[int, int]] = []
         self._alive, self._looks = 0, 0  # tracks of the fullest system, summed over looks
         self._ended: list[Episodes] = []
-        self._said: list[Looked] = []
+        self._said = Told(settings.evidence)
 
     def add(self, name: str, period: float) -> None:
         """Take in a system that appears later."""
@@ -125,13 +126,13 @@ class Picture:
         return Decisions(joined_episodes([*self._ended, self._decider.open()]), self._decider.conflicts())
 
     def evidence(self) -> Evidence:
-        """Return all ratios at looks."""
-        none = np.zeros(0)
-        said = [Looked(np.zeros((0, 2), np.int64), none, none, none, none), *self._said]
-        ends, time, llr, *_ = (np.concatenate(columns) for columns in zip(*said, strict=True))
-        pairs, pair = np.unique(ends, axis=0, return_inverse=True)
-        order = np.lexsort((time, pair.reshape(-1)))
-        return Evidence(pairs, pair.reshape(-1)[order], time[order], llr[order])
+        """Return the ratios at looks, so many at most (`SystemsSettings.evidence`)."""
+        return self._said.evidence()
+
+    @property
+    def told_every(self) -> int:
+        """Of so many looks `evidence` tells one."""
+        return self._said.every
 
     @property
     def prior(self) -> float:
@@ -226,7 +227,7 @@ class Picture:
             span=said.span,
             alive=alive,
         )
-        self._said.append(said)
+        self._said.add(said.pairs, said.time, said.llr)
         self._ended.append(decided.ended)
         members = self.membership
         for g in np.flatnonzero(~alive & (last >= self._before - self._settings.silent)).tolist():

@@ -190,6 +190,7 @@ class SystemsSettings:
         rivals: tracks at a time, at least, of which a partner could be any.
         lately: s within which another system must have seen a target for its frame to hold.
         step: standard deviations of a report by which a correction steps, from which a state is moved with it.
+        evidence: ratios of pairs at looks that are kept for the report; of more, those of every second look, fourth ...
     """
 
     reference: str = ""
@@ -209,6 +210,7 @@ class SystemsSettings:
     rivals: float = 2.0
     lately: float = 30.0
     step: float = 2.0
+    evidence: int = 1_000_000
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""
@@ -230,6 +232,7 @@ class SystemsSettings:
             "rivals",
             "lately",
             "step",
+            "evidence",
         ):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ModelError(f"systems.{name} must be positive and finite, got {getattr(self, name)}.")
