@@ -39,6 +39,7 @@ _Array = npt.NDArray[Any]
 
 SCHEMA = 2
 _ROWS = 1 << 16  # of a segment
+_BATCH = 1 << 13  # of these, read at a time
 _FOREIGN = ("time", "track_number", "latitude", "longitude", "vx", "vy", "coasted")
 
 
@@ -66,11 +67,13 @@ class Journal:
             self._seal(kind)
 
     def parts(self, kind: str, columns: Sequence[str] | None = None) -> Iterator[dict[str, _Array]]:
-        """Yield all rows of a kind, segment by segment; `columns` names those wanted, None: all."""
+        """Yield all rows of a kind, some thousands at a time; `columns` names those wanted, None: all."""
         for k in range(len(self._sealed.get(kind, ()))):
             with pa.memory_map(str(self._path(kind, k))) as source:
-                table = pa.ipc.open_file(source).read_all()
-                yield from_table(table if columns is None else table.select(list(columns)))
+                reader = pa.ipc.open_file(source)
+                for batch in range(reader.num_record_batches):
+                    table = pa.Table.from_batches([reader.get_batch(batch)])
+                    yield from_table(table if columns is None else table.select(list(columns)))
         if self._count.get(kind):
             waiting = self._waiting[kind]
             yield joined(waiting if columns is None else [{name: part[name] for name in columns} for part in waiting])
@@ -133,7 +136,7 @@ class Journal:
             sums = self._sealed.setdefault(kind, [])
             with _whole(self._path(kind, len(sums))) as temporary:
                 with pa.OSFile(str(temporary), "wb") as sink, pa.ipc.new_file(sink, part.schema) as writer:
-                    writer.write_table(part)
+                    writer.write_table(part, max_chunksize=_BATCH)
                 sums.append(_checksum(temporary))
         rest = n - n % _ROWS
         self._waiting[kind] = [{name: values[rest:].copy() for name, values in columns.items()}]

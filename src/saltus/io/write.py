@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["blamed", "output_directory", "output_file", "write_batches", "write_json", "write_table", "write_text"]
 
-_GROUP = 1 << 17  # rows of a table that are written together
+_GROUP = 1 << 16  # rows of a table that are written together
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 

@@ -210,7 +210,7 @@ class SystemsSettings:
     rivals: float = 2.0
     lately: float = 30.0
     step: float = 2.0
-    evidence: int = 1_000_000
+    evidence: int = 500_000
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""

@@ -45,6 +45,7 @@ class Told:
         none = np.zeros(0)
         looks = [_Look(0, np.zeros((0, 2), np.int64), none, none), *self._looks]
         ends, time, llr = (np.concatenate(columns) for columns in list(zip(*looks, strict=True))[1:])
-        pairs, pair = np.unique(ends, axis=0, return_inverse=True)
-        order = np.lexsort((time, pair.reshape(-1)))
-        return Evidence(pairs, pair.reshape(-1)[order], time[order], llr[order])
+        width = int(ends.max(initial=0)) + 1
+        named, pair = np.unique(ends[:, 0] * width + ends[:, 1], return_inverse=True)
+        order = np.lexsort((time, pair))
+        return Evidence(np.stack(np.divmod(named, width), axis=-1), pair[order], time[order], llr[order])
