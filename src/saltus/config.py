@@ -19,7 +19,9 @@ sigma_xy = 10.0                   # m (plane and geodetic positions),
 sigma_altitude = 8.0              # m
 sigma_time = 0.06                 # s (time stamps of positions)
 period = 4.0                      # optional: s between two reports of one target
-correlation_time = 5.0            # optional: s that errors last
+sigma_lasting = 0.008             # errors that last: degrees of azimuth, m of sources of positions,
+correlation_time = 13.0           # how long, s,
+lasting_scale_distance = 13e3     # and m from the site at which they are 1.4 times as large
 system = "platform"               # optional: sources of one system make common local tracks
 
 [editions]
@@ -78,7 +80,9 @@ _HINTS = {
     "sigma_xy": "one standard deviation in m, above 0 and up to 10000",
     "sigma_altitude": "one standard deviation in m, above 0 and up to 10000",
     "sigma_time": "one standard deviation in s, 0 to 10",
+    "sigma_lasting": "one standard deviation, m of positions and degrees of azimuths, above 0 and up to 10000",
     "correlation_time": "s, above 0 and up to 3600",
+    "lasting_scale_distance": "m, above 0 and up to 1e7",
     "name": 'text, as name = "BCN"',
     "system": 'text, as system = "platform"',
     "period": "the time between two reports of one target in s, above 0 and up to 3600",
@@ -127,7 +131,9 @@ class SensorConfig(BaseModel):
     sigma_altitude: _Sigma | None = None
     sigma_time: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
     period: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
+    sigma_lasting: _Sigma | None = None
     correlation_time: Annotated[float, Field(gt=0.0, le=3600.0)] | None = None
+    lasting_scale_distance: Annotated[float, Field(gt=0.0, le=1e7)] | None = None
     system: _Name = ""
 
     @model_validator(mode="after")

@@ -23,14 +23,14 @@ def assert_right(found, dt):
 
 
 def test_they_are_those_computed_afresh(rng):
-    table = Intervals([(MOTION, [CHAIN, ONLY]), (STILL, [ONLY])])
+    table = Intervals([(MOTION, [CHAIN, ONLY], 0), (STILL, [ONLY], 0)])
     for _ in range(30):  # more than the first room, many of them met before
         dt = rng.integers(0, 200, rng.integers(0, 25)) / 128.0
         assert_right(table.at(dt), dt)
 
 
 def test_it_forgets_rather_than_grows(rng):
-    table = Intervals([(MOTION, [CHAIN, ONLY]), (STILL, [ONLY])])
+    table = Intervals([(MOTION, [CHAIN, ONLY], 0), (STILL, [ONLY], 0)])
     for _ in range(70):
         dt = rng.uniform(0.0, 10.0, 100)  # no two alike
         assert_right(table.at(dt), dt)
@@ -38,7 +38,17 @@ def test_it_forgets_rather_than_grows(rng):
 
 
 def test_more_at_once_than_is_worth_remembering(rng):
-    table = Intervals([(MOTION, [CHAIN, ONLY]), (STILL, [ONLY])])
+    table = Intervals([(MOTION, [CHAIN, ONLY], 0), (STILL, [ONLY], 0)])
     dt = rng.uniform(0.0, 10.0, 5000)
     assert_right(table.at(dt), dt)
     assert len(table) == 1
+
+
+def test_further_states_have_rows_and_columns_of_zeros():
+    (plain,), (wide,) = (Intervals([(MOTION, [CHAIN, ONLY], more)]).at(np.array([0.7, 2.0])) for more in (0, 3))
+    n = plain.F.shape[-1]
+    np.testing.assert_array_equal(wide.F[..., :n, :n], plain.F)
+    np.testing.assert_array_equal(wide.Q[..., :n, :n], plain.Q)
+    for matrix in (wide.F, wide.Q):
+        assert matrix.shape[-2:] == (n + 3, n + 3)
+        assert not matrix[..., n:, :].any() and not matrix[..., n:].any()

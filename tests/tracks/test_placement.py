@@ -1,8 +1,11 @@
 """Reports of moving observers in the tracker's plane, against PROJ."""
 
+from dataclasses import replace
+
 import numpy as np
 import pyproj
 import pytest
+from tracking_scenes import measured
 
 from saltus.config import SensorConfig
 from saltus.engine.setup import given_noise
@@ -10,7 +13,10 @@ from saltus.errors import DataError
 from saltus.geo import Plane, Site
 from saltus.io.assemble import CATEGORIES
 from saltus.records import Kind, Plots, Source, System
+from saltus.tracks.local import local_system
 from saltus.tracks.measurements import Noise, default_noise, make_plane, place_plots
+from saltus.tracks.noise import LEAST
+from saltus.tracks.rows import Assignments, join_rows
 
 N = 30
 NOISE = Noise(range=3.0, azimuth=0.01, elevation=0.02, xy=2.0, altitude=1.0)
@@ -102,20 +108,36 @@ def test_reports_without_observer_are_seen_from_the_source_s_site(sea):
 
 
 @pytest.mark.parametrize("tau", [0.3, 4.0])
-def test_errors_that_last_average_to_what_the_filter_believes(tau):
-    """The mean of many reports with errors of correlation a^|k|, against the inflation a configuration gives."""
-    sensor = SensorConfig(name="ship", sigma_xy=2.0, correlation_time=tau)
-    given = given_noise(sensor, period=0.5)
-    n, a = 500, np.exp(-0.5 / tau)
-    k = np.arange(n)
+def test_errors_that_last_average_to_what_evidence_believes(tau):
+    """The mean of many reports with errors of correlation a^|k|, against what each is taken to tell."""
+    n, dt = 500, 0.5
+    a, k = np.exp(-dt / tau), np.arange(n)
     cov = 4.0 * a ** np.abs(k[:, None] - k)
-    assert given["xy"] ** 2 * given["inflation"] / n == pytest.approx(cov.mean(), rel=0.05)
-    assert "inflation" not in given_noise(SensorConfig(name="ship", sigma_xy=2.0), period=0.5)
+    m = measured(dt * k, np.zeros((n, 2)), 2.0)
+    m = replace(m, lasting=np.broadcast_to(2.0 * np.eye(2), (n, 2, 2)), lasting_time=np.full(n, tau))
+    rows = join_rows([])
+    found = Assignments(np.ones(n, np.int64), np.zeros(n, bool), np.zeros(n, bool), np.array([1]), [])
+    R = local_system("s", m, found, rows, np.full(n, -1), use_identity=True).view.tracks.R
+    assert R[5, 0, 0] / n == pytest.approx(cov.mean(), rel=0.05)
+    assert R[0, 0, 0] == 4.0  # the first of a track has none before it
+
+
+def test_a_configured_correlation_time_is_that_of_the_deviation_given():
+    radar = Source(System(48, 1, 2), CATEGORIES[48].traits, azimuth_lsb=1e-4)
+    ship = Source(System(None, None, None, "ship"))
+    given = given_noise(SensorConfig(name="ship", sigma_xy=2.0, correlation_time=5.0), ship)
+    assert (given["lasting"], given["xy"], given["lasting_time"]) == (2.0, LEAST, 5.0)
+    given = given_noise(SensorConfig(sac=1, sic=2, sigma_azimuth=0.1, sigma_range=9.0, correlation_time=5.0), radar)
+    assert (given["lasting"], given["range"]) == (np.radians(0.1), 9.0)
+    assert given["azimuth"] == pytest.approx(1e-4 / np.sqrt(12.0))
+    given = given_noise(SensorConfig(name="ship", sigma_xy=2.0, sigma_lasting=7.0, lasting_scale_distance=9e3), ship)
+    assert (given["lasting"], given["xy"], given["lasting_distance"]) == (7.0, 2.0, 9e3)
+    assert "lasting" not in given_noise(SensorConfig(name="ship", sigma_xy=2.0), ship)
 
 
 @pytest.mark.parametrize(("told", "time"), [({"sigma_time": 0.05}, 0.05), ({"sigma_xy": 3.0}, 0.0), ({}, None)])
 def test_a_position_whose_noise_is_configured_has_exact_times_unless_told(told, time):
-    assert given_noise(SensorConfig(name="ship", **told), period=0.5).get("time") == time
+    assert given_noise(SensorConfig(name="ship", **told), Source(System(None, None, None, "ship"))).get("time") == time
 
 
 @pytest.mark.parametrize(("category", "time"), [(21, 0.2 / np.sqrt(12.0)), (10, 0.0)])
@@ -132,10 +154,12 @@ def test_transponders_send_positions_a_little_off_their_time(sea, category, time
     assert not added[:, 2].any() and not added[:, :, 2].any()
 
 
-def test_inflation_is_the_source_s(sea):
-    ship, (x, y, _), _ = sea
-    m = place_plots(
-        reports(ship, Kind.PLANE, x=x, y=y), Plane(1.1, 0.18), [None], {0: Noise(inflation=7.0)}, (0.0, 30.0)
-    )
-    np.testing.assert_array_equal(m.inflation, 7.0)
-    np.testing.assert_allclose(m.cov[:, 0, 0], Noise().xy ** 2, rtol=1e-2)
+def test_lasting_errors_are_part_of_the_covariance_and_grow_with_distance(sea):
+    ship, (x, y, _), site = sea
+    noise = {0: Noise(xy=3.0, lasting=7.0, lasting_time=9.0, lasting_distance=2e3)}
+    m = place_plots(reports(ship, Kind.PLANE, x=x, y=y), Plane(1.1, 0.18), [site], noise, (0.0, 30.0))
+    white = place_plots(reports(ship, Kind.PLANE, x=x, y=y), Plane(1.1, 0.18), [site], {0: Noise(xy=3.0)}, (0.0, 30.0))
+    scale = 7.0 * np.sqrt(1.0 + (np.hypot(x, y) / 2e3) ** 2)
+    np.testing.assert_allclose(m.lasting, scale[:, None, None] * np.eye(2), rtol=2e-3)
+    np.testing.assert_allclose((m.cov - white.cov)[:, 0, 0], scale**2, rtol=4e-3)
+    assert not white.lasting.any() and (m.lasting_time == 9.0).all()

@@ -267,7 +267,8 @@ def measurements(time, position, ray, azimuth):
         polar=np.column_stack([np.hypot(*ray.T), azimuth]), ray=ray, lever=np.zeros((n, 2)),
         elevation=blank, range_rate=blank, sigma_range_rate=blank, origin=np.full((n, 2), np.nan), bearing=blank,
         sigma_bearing=blank, jitter=np.zeros(n),
-        inflation=np.ones(n),
+        lasting=np.zeros((n, 2, 2)),
+        lasting_time=np.full(n, 60.0),
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ from tracking_scenes import fed, tracker_of
 
 from saltus.geo import Plane
 from saltus.records import Kind, Plots, Source, System
+from saltus.tracks.colour import Colour
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate
 from saltus.tracks.kinematics import Chosen, Start, make_kinematics
@@ -116,26 +117,32 @@ def test_one_update_is_the_extended_kalman_filter_s(angle, rng):
     assert seen.score()[0, 0] == pytest.approx(-0.5 * (nu**2 / S + np.log(2 * np.pi * S)), abs=1e-4)
 
 
-def test_inflation_widens_the_update_and_no_gate():
-    """With the variance of a bearing times 9 the update is that of a sensor three times as coarse."""
+def test_lasting_errors_taken_for_noise_widen_the_update_and_no_gate():
+    """Where a track has no state for them, so many bearings tell less; with one, they are told apart from its place."""
     origin, mean = [[0.0, 0.0]], np.array([200.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     cov = np.diag([9.0, 0.01, 9.0, 0.01, 1.0, 1.0])
     m = bearings([1e-3], origin, [np.pi / 2 + 0.05])
+    lasting = np.zeros((1, 2, 2))
+    lasting[0, 0, 0] = 2.0 * SIGMA
+    lasting_m = replace(m, lasting=lasting, sigma_bearing=np.array([np.sqrt(5.0) * SIGMA]))
 
-    def after(seen):
+    def after(seen, colours, states):
         kinematics, life = one_track(mean, cov)
+        kinematics = kinematics.adopt(colours, TrackerSettings(lasting_states=states))
         found = seen_by(kinematics, life, seen, np.array([0]))
         kinematics.absorb(found.pairs.track, found.copies, Chosen.sure(found.copy, found.plan, found.covs[:, 0]))
         return found, kinematics.moments(found.pairs.track)
 
-    inflated, moments = after(replace(m, inflation=np.array([9.0])))
-    _, coarse = after(replace(m, sigma_bearing=np.array([3.0 * SIGMA])))
+    colours = [Colour(), Colour(1, 9.0, 4.0)]
+    noise, moments = after(lasting_m, colours, 0)
+    _, coarse = after(replace(m, sigma_bearing=np.array([np.sqrt(1.0 + 4.0 * 4.0) * SIGMA])), [], 0)
     np.testing.assert_allclose(moments.mean, coarse.mean, atol=1e-6)
     np.testing.assert_allclose(moments.cov, coarse.cov, atol=1e-6)
-    assert inflated.d2[0] == after(m)[0].d2[0]
-    far = bearings([1e-3], origin, [np.pi / 2 + 0.12])
-    assert len(after(replace(far, inflation=np.array([9.0])))[0].copy) == 0
-    assert len(after(replace(far, sigma_bearing=np.array([3.0 * SIGMA])))[0].copy) == 1
+    state, held = after(lasting_m, colours, 4)
+    _, plain = after(replace(m, sigma_bearing=np.array([np.sqrt(5.0) * SIGMA])), [], 0)
+    np.testing.assert_allclose(held.mean, plain.mean, atol=1e-6)  # the first one tells as much as noise so large
+    np.testing.assert_allclose(held.cov, plain.cov, atol=1e-6)
+    assert noise.d2[0] == pytest.approx(state.d2[0])
 
 
 def test_gates_of_bearings():

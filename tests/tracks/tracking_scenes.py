@@ -57,7 +57,8 @@ def measured(time, xy, sigma, *, altitude=None, sigma_altitude=10.0, source=0, i
         bearing=np.full(n, np.nan),
         sigma_bearing=np.full(n, np.nan),
         jitter=np.zeros(n),
-        inflation=np.ones(n),
+        lasting=np.zeros((n, 2, 2)),
+        lasting_time=np.full(n, 60.0),
     )
 
 

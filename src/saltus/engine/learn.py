@@ -90,7 +90,7 @@ def _sensor(
     own, at = plots.take(plots.source == s), np.flatnonzero(m.source == s)
     period = sensor.period if sensor is not None and sensor.period else _period(source, own, m, at, config, told)
     used = NO_PERIOD if np.isnan(period) else period
-    given = given_noise(sensor, used)
+    given = given_noise(sensor, source)
     density = config.tracker.clutter_density
     return SensorSetup(
         source=source,

@@ -39,7 +39,9 @@ def _sane(noise: Noise) -> Noise:
     """Refuse deviations that cannot be."""
     for f in dataclasses.fields(noise):
         value = getattr(noise, f.name)
-        if not (0.0 <= value if f.name == "time" else 0.0 < value) or not np.isfinite(value):
+        if f.name == "lasting_distance" and value == np.inf:
+            continue
+        if not (0.0 <= value if f.name in ("time", "lasting") else 0.0 < value) or not np.isfinite(value):
             raise ValueError(f"{f.name} = {value} is no standard deviation")
     return noise
 
@@ -164,7 +166,7 @@ def _sensor(learnt: _Sensor, config: Config) -> SensorSetup:
     set_period = None if sensor is None else sensor.period
     told = set_period or learnt.told_period
     period = set_period or learnt.period
-    given = given_noise(sensor, period)
+    given = given_noise(sensor, source)
     return SensorSetup(
         source=source,
         name=sensor.name if sensor is not None and sensor.name else str(source.system),

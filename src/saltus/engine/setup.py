@@ -10,9 +10,10 @@ from saltus.config import Config, SensorConfig
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots, Source
 from saltus.tracks.background import Background
+from saltus.tracks.colour import Colour
 from saltus.tracks.local import Party, group_sources
 from saltus.tracks.measurements import Measurements, Noise, place_plots
-from saltus.tracks.noise import NoiseEstimate
+from saltus.tracks.noise import LEAST, LEAST_ANGLE, NoiseEstimate
 from saltus.tracks.slices import slice_width
 from saltus.tracks.sources import SourceSetup, TrackerSetup
 
@@ -44,7 +45,21 @@ class SensorSetup:
 
     def of_tracker(self) -> SourceSetup:
         """What a tracker is told of it."""
-        return SourceSetup(self.period, self.wait, self.kind, self.background)
+        return SourceSetup(self.period, self.wait, self.kind, self.background, self.colour)
+
+    @property
+    def colour(self) -> Colour:
+        """Its errors that last.
+
+        Of errors with the correlation a^|k| between reports k periods apart, a = exp(-period / tau), the mean of many
+        has (1 + a)/(1 - a) times the variance of as many independent ones: their inflation where they are taken for
+        such.
+        """
+        noise = self.noise
+        if not noise.lasting:
+            return Colour()
+        inflation = float(1.0 / np.tanh(0.5 * self.period / noise.lasting_time))
+        return Colour(2 if self.kind == Kind.PLANE else 1, noise.lasting_time, inflation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,11 +105,11 @@ def site_of(sensor: SensorConfig | None) -> Site | None:
     return Site(float(latitude), float(longitude), height, sigma)
 
 
-def given_noise(sensor: SensorConfig | None, period: float) -> dict[str, float]:
+def given_noise(sensor: SensorConfig | None, source: Source) -> dict[str, float]:
     """Return the fields of Noise that a configuration gives.
 
-    Of errors with the correlation a^|k| between reports k periods apart, a = exp(-period / correlation_time), the mean
-    of many has (1 + a)/(1 - a) times the variance of as many independent ones: their inflation.
+    Where it gives a `correlation_time` and no `sigma_lasting`, the errors last whose deviation it gives, of azimuth or
+    position; of each report's own are left the steps of the source's numbers.
     """
     if sensor is None:
         return {}
@@ -109,6 +124,22 @@ def given_noise(sensor: SensorConfig | None, period: float) -> dict[str, float]:
         "xy": sensor.sigma_xy,
         "altitude": sensor.sigma_altitude,
         "time": 0.0 if sensor.sigma_time is None and sensor.sigma_xy is not None else sensor.sigma_time,
-        "inflation": sensor.correlation_time and float(1.0 / np.tanh(0.5 * period / sensor.correlation_time)),
+        "lasting_time": sensor.correlation_time,
+        "lasting_distance": sensor.lasting_scale_distance,
     }
-    return {field: value for field, value in given.items() if value is not None}
+    return {field: value for field, value in given.items() if value is not None} | _lasting(sensor, source)
+
+
+def _lasting(sensor: SensorConfig, source: Source) -> dict[str, float]:
+    """Return the deviation of errors that last, and what it leaves to each report by itself."""
+    turns = source.traits.rotating or sensor.sigma_xy is None
+    if sensor.sigma_lasting is not None:
+        return {"lasting": float(np.radians(sensor.sigma_lasting)) if turns else sensor.sigma_lasting}
+    if sensor.correlation_time is None:
+        return {}
+    if turns and sensor.sigma_azimuth is not None:
+        least = max(source.azimuth_lsb / np.sqrt(12.0), LEAST_ANGLE)
+        return {"lasting": float(np.radians(sensor.sigma_azimuth)), "azimuth": least}
+    if sensor.sigma_xy is not None:
+        return {"lasting": sensor.sigma_xy, "xy": max(source.xy_lsb / np.sqrt(12.0), LEAST)}
+    return {}

@@ -103,6 +103,15 @@ class Bank:
         beliefs = Belief(*(np.asarray(state[name]) for name in Belief._fields))
         self._store.write(np.arange(self._capacity), self._belief(beliefs, self._capacity))
 
+    def widened(self, more: int) -> "Bank":
+        """Return a bank of the same rows with further states behind the others, N(0, 1) and independent of them."""
+        bank, held = Bank(self.n + more, self.sizes, backend=self.backend), self.state()
+        n, behind = self.n, [(0, 0)] * (1 + len(self.sizes))
+        covs = np.pad(held["covs"], [*behind, (0, more), (0, more)])
+        covs[..., np.arange(n, n + more), np.arange(n, n + more)] = 1.0
+        bank.restore(held | {"means": np.pad(held["means"], [*behind, (0, more)]), "covs": covs})
+        return bank
+
     def take(self, rows: _Rows) -> "Bank":
         """Return a new bank whose rows 0..k-1 are copies of `rows` (repeats allowed: hypotheses, resampling)."""
         rows = self._in_use(rows)

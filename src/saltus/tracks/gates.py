@@ -6,9 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.tracks.associate import Pairs, equal_codes, join_pairs, near_pairs, nearest_pairs
+from saltus.tracks.colour import NO_SOURCE
 from saltus.tracks.faults import SourceCondition, rays
 from saltus.tracks.identity import conflicting
-from saltus.tracks.kinematics import Kinematics, Plan
+from saltus.tracks.kinematics import MOTION, Kinematics, Plan
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.range_rate import with_range_rates
@@ -51,6 +52,8 @@ class Ahead(NamedTuple):
     copies: Kinematics
     offset: _Array  # (P,) s, <= 0: how far a report lies before its track's time
     late: _Array  # (P, 3, 3): what the error of its time stamp adds to a report's covariance
+    lasting: _Array  # (P, 2, slots): how states of lasting errors enter it
+    carried: _Array  # (P, 2, 2): covariance of the report's that these stand for
     extra: _Array  # (P, 3, 3): what else does, whatever is wrong with the report
     nu: _Array  # (P, 3): innovation of the most agile mode
     S: _Array  # (P, 3, 3): its covariance
@@ -139,15 +142,18 @@ class Gate:
     ) -> Gated:
         """What is left of pairs inside their gates."""
         plot, offset = plot[inside], ahead.offset[inside]
-        mixture = ahead.copies.moments(inside)
         position, late, extra = m.position[plot].copy(), ahead.late[inside], ahead.extra[inside]
-        y, S = _innovation(mixture.mean, mixture.cov, offset, m.cov[plot] + late + extra)
+        lasting, carried = ahead.lasting[inside], ahead.carried[inside]
+        R = m.cov[plot] + late + extra
+        R[:, :2, :2] -= carried
+        y, S = _innovation(*ahead.copies.mixture(inside), offset, lasting, R)
         d2, _ = distances(position - y, S)
         _, d2_height = distances(ahead.nu[inside], ahead.S[inside])
         height_used = np.isfinite(position[:, 2]) & (d2_height <= self.height)
         position[~height_used, 2] = np.nan
-        plan, log_scale = Plan.of_positions(position, offset), np.zeros(len(inside))
-        covs = (source.law.covariances(m, plot) + late[:, None]) * m.inflation[plot, None, None, None] + extra[:, None]
+        plan, log_scale = Plan.of_positions(position, offset, lasting), np.zeros(len(inside))
+        covs = source.law.covariances(m, plot) + (late + extra)[:, None]
+        covs[..., :2, :2] += self._told_again(ahead.copies, m, plot, carried)[:, None]
         if np.isfinite(m.range_rate[plot]).any():
             plan, covs, used = with_range_rates(plan, covs, ahead.copies, inside, m, plot, self.height)
             log_scale += np.where(np.isnan(m.range_rate[plot]), 0.0, np.where(used, *self._rates))
@@ -163,6 +169,13 @@ class Gate:
             ahead.copies,
             inside,
         )
+
+    def _told_again(self, copies: Kinematics, m: Measurements, plot: _Index, carried: _Array) -> _Array:
+        """What lasting errors add to covariances (k, 2, 2): less what states stand for, and more without these."""
+        if not m.lasting[plot].any():
+            return -carried
+        again = copies.colours.again(int(m.source[plot[0]]))
+        return again * (m.lasting[plot] @ m.lasting[plot].swapaxes(1, 2) - carried) - carried
 
     def _near(self, life: Lifecycle, m: Measurements, index: _Index, source: SourceCondition, prior: _Array) -> Pairs:
         """Pair what cheap bounds allow."""
@@ -197,7 +210,7 @@ class Gate:
         at = np.flatnonzero((d2 > self.horizontal) & (trusted | lasting))
         if len(live) == 1 or not len(at):
             return out
-        predicted = ahead.S[at] - m.cov[plot[at]]
+        predicted = ahead.S[at] - m.cov[plot[at]]  # what states of lasting errors stand for stays taken off
         wide = predicted[:, None] + source.law.covariances(m, plot[at], live)
         k, h = wide.shape[:2]
         d2_wide = distances(np.repeat(ahead.nu[at], h, axis=0), wide.reshape(-1, 3, 3))[0].reshape(k, h)
@@ -322,18 +335,22 @@ def predict(
         life: their lifecycle.
         m: all measurements.
         track: rows, (P,), repeats allowed.
-        plot: the one to be compared with each.
+        plot: the one to be compared with each, all of one source.
         extra: covariances that plots have beyond those of `m` and of their time stamps, (P, 3, 3).
     """
-    dt = m.time[plot] - life.time[track]
+    dt, source = m.time[plot] - life.time[track], int(m.source[plot[0]]) if len(plot) else NO_SOURCE
     offset = np.minimum(dt, 0.0)  # a plot of another source may come a little late
-    copies = kinematics.predicted(track, np.maximum(dt, 0.0))
+    copies = kinematics.predicted(track, np.maximum(dt, 0.0), source, m.time[plot])
+    lasting = copies.colours.columns(source, m.lasting[plot])
+    carried = copies.colours.carried(source, m.lasting[plot])
     late = m.stamped(plot, life.mean[track][:, _VELOCITY[:2]])
-    y, S = _innovation(*copies.widest(np.arange(len(dt))), offset, m.cov[plot] + late + extra)
-    return Ahead(copies, offset, late, extra, m.position[plot] - y, S, y[:, :2])
+    R = m.cov[plot] + late + extra
+    R[:, :2, :2] -= carried
+    y, S = _innovation(*copies.widest(np.arange(len(dt))), offset, lasting, R)
+    return Ahead(copies, offset, late, lasting, carried, extra, m.position[plot] - y, S, y[:, :2])
 
 
-def _innovation(mean: _Array, P: _Array, offset: _Array, R: _Array) -> tuple[_Array, _Array]:
+def _innovation(mean: _Array, P: _Array, offset: _Array, lasting: _Array, R: _Array) -> tuple[_Array, _Array]:
     """Return the measurement predicted `offset` seconds from the rows' time, and its innovation covariance."""
     t = offset[:, None, None]
     pp, pv, vv = (
@@ -342,7 +359,15 @@ def _innovation(mean: _Array, P: _Array, offset: _Array, R: _Array) -> tuple[_Ar
         P[:, _VELOCITY[:, None], _VELOCITY],
     )
     y = mean[:, _POSITION] + offset[:, None] * mean[:, _VELOCITY]
-    return y, pp + t * (pv + pv.swapaxes(-1, -2)) + t * t * vv + R
+    S = pp + t * (pv + pv.swapaxes(-1, -2)) + t * t * vv + R
+    if lasting.any():
+        L = lasting.swapaxes(1, 2)
+        cross = (P[:, _POSITION, MOTION:] + t * P[:, _VELOCITY, MOTION:]) @ L
+        y[:, :2] += (lasting @ mean[:, MOTION:, None])[..., 0]
+        S[:, :, :2] += cross
+        S[:, :2] += cross.swapaxes(1, 2)
+        S[:, :2, :2] += lasting @ P[:, MOTION:, MOTION:] @ L
+    return y, S
 
 
 def distances(nu: _Array, S: _Array) -> tuple[_Array, _Array]:

@@ -24,10 +24,17 @@ class Matrices(NamedTuple):
 
 
 class Intervals:
-    """F, Q and transition matrices of motions and their chains, computed once for each length of interval."""
+    """F, Q and transition matrices of motions and their chains, computed once for each length of interval.
 
-    def __init__(self, parts: Sequence[tuple[Motion, Sequence[Chain]]]) -> None:
-        """Begin with the interval of length 0; every motion is bound to the chains that go with it."""
+    Behind a motion's states may come others that are no function of the interval alone: theirs are 0.
+    """
+
+    def __init__(self, parts: Sequence[tuple[Motion, Sequence[Chain], int]]) -> None:
+        """Begin with the interval of length 0.
+
+        Args:
+            parts: motions, the chains that each is bound to, and the number of further states.
+        """
         self._parts = parts
         self._known: _Array = np.zeros(0)  # ascending
         self._row: npt.NDArray[np.intp] = np.zeros(0, np.intp)  # of the columns, for each known interval
@@ -43,8 +50,8 @@ class Intervals:
         place = self._places(dt)
         if (place < 0).sum() > _MOST:  # more than is worth remembering
             return tuple(
-                Matrices(*motion.step(dt)[:2], [None if len(c) == 1 else c.transition(dt) for c in chains])
-                for motion, chains in self._parts
+                Matrices(*_wide(motion, dt, more), [None if len(c) == 1 else c.transition(dt) for c in chains])
+                for motion, chains, more in self._parts
             )
         if (place < 0).any():
             if len(self._known) > _MOST:
@@ -55,7 +62,7 @@ class Intervals:
         columns = (column[place] for column in self._columns)
         return tuple(
             Matrices(next(columns), next(columns), [None if len(chain) == 1 else next(columns) for chain in chains])
-            for _, chains in self._parts
+            for _, chains, _ in self._parts
         )
 
     def _places(self, dt: _Array) -> npt.NDArray[np.intp]:
@@ -65,8 +72,8 @@ class Intervals:
 
     def _learn(self, dt: _Array) -> None:
         new = []
-        for motion, chains in self._parts:
-            new += [*motion.step(dt)[:2], *(chain.transition(dt) for chain in chains if len(chain) > 1)]
+        for motion, chains, more in self._parts:
+            new += [*_wide(motion, dt, more), *(chain.transition(dt) for chain in chains if len(chain) > 1)]
         begin, end = len(self._known), len(self._known) + len(dt)
         if not self._columns or end > len(self._columns[0]):
             old, room = self._columns, max(2 * end, 64)
@@ -77,3 +84,12 @@ class Intervals:
             column[begin:end] = values
         at = np.searchsorted(self._known, dt)
         self._known, self._row = np.insert(self._known, at, dt), np.insert(self._row, at, np.arange(begin, end))
+
+
+def _wide(motion: Motion, dt: _Array, more: int) -> tuple[_Array, _Array]:
+    """Return F and Q, with rows and columns of 0 for further states."""
+    F, Q = motion.step(dt)[:2]
+    if more:
+        beside = [(0, 0)] * (F.ndim - 2) + [(0, more)] * 2
+        F, Q = np.pad(F, beside), np.pad(Q, beside)
+    return F, Q

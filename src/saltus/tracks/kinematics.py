@@ -1,6 +1,6 @@
 """The filters of all tracks as rows: horizontal and vertical side by side, or jointly in three dimensions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -10,11 +10,13 @@ import numpy.typing as npt
 from saltus.errors import NumericalError
 from saltus.filters import Bank, Belief
 from saltus.models import Chain, Motion, constant_velocity
+from saltus.tracks.colour import NO_SOURCE, Colour, Colours
 from saltus.tracks.intervals import Intervals, Matrices
 from saltus.tracks.modes import Mode, horizontal_chain, vertical_chain
-from saltus.tracks.settings import FilterSettings
+from saltus.tracks.settings import FilterSettings, TrackerSettings
 
 __all__ = [
+    "MOTION",
     "Channel",
     "Chosen",
     "Kinematics",
@@ -30,6 +32,7 @@ _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
 
 _HEIGHT = 2  # component of a measurement
+MOTION = 6  # states of position and velocity; those of lasting errors follow
 
 
 class Moments(NamedTuple):
@@ -42,20 +45,29 @@ class Moments(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """Measurements z = C x + v of states (x, vx, y, vy, z, vz), one for each of k rows.
+    """Measurements z = C x + v of states (x, vx, y, vy, z, vz, lasting errors), one for each of k rows.
 
     Two components measure in the plane, the third height: a filter of one takes its own. What is not measured is NaN.
     """
 
     z: _Array  # (k, m)
-    C: _Array  # (k, m, 6)
+    C: _Array  # (k, m, 6 + slots)
 
     @classmethod
-    def of_positions(cls, position: _Array, offset: _Array) -> "Plan":
-        """Return measurements of positions (k, 3), offset s (k,) from the time of their row along its velocity."""
-        C, axis = np.zeros((len(position), 3, 6)), np.arange(3)
+    def of_positions(cls, position: _Array, offset: _Array, lasting: _Array | None = None) -> "Plan":
+        """Return measurements of positions.
+
+        Args:
+            position: (k, 3).
+            offset: s from the time of their row along its velocity, (k,).
+            lasting: how states of lasting errors enter, (k, 2, slots).
+        """
+        slots = 0 if lasting is None else lasting.shape[2]
+        C, axis = np.zeros((len(position), 3, MOTION + slots)), np.arange(3)
         C[:, axis, 2 * axis] = 1.0
         C[:, axis, 2 * axis + 1] = offset[:, None]
+        if lasting is not None:
+            C[:, :2, MOTION:] = lasting
         return cls(position, C)
 
     def take(self, index: _Rows) -> "Plan":
@@ -79,10 +91,21 @@ class Chosen(NamedTuple):
 
 
 class Start(NamedTuple):
-    """Where rows begin: state (k, 6) with covariance (k, 6, 6)."""
+    """Where rows begin: state (k, n) with covariance (k, n, n), and whose lasting errors stand behind the motion's."""
 
     mean: _Array
     cov: _Array
+    colours: Colours | None = None  # None: of motion alone, n = 6
+
+    def beside(self, colours: Colours, cross: _Array | None = None) -> "Start":
+        """Add states of lasting errors N(0, I), with covariances `cross` (k, 6, slots) to those of the motion."""
+        k, n = len(self.mean), MOTION + colours.slots
+        mean, cov = np.zeros((k, n)), np.zeros((k, n, n))
+        mean[:, :MOTION], cov[:, :MOTION, :MOTION] = self.mean, self.cov
+        cov[:, MOTION:, MOTION:] = np.eye(colours.slots)
+        if cross is not None:
+            cov[:, :MOTION, MOTION:], cov[:, MOTION:, :MOTION] = cross, cross.swapaxes(1, 2)
+        return Start(mean, cov, colours)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +114,7 @@ class Channel:
 
     axes: npt.NDArray[np.intp]
     chains: tuple[Chain, ...]
-    states: npt.NDArray[np.intp]  # positions of the channel's states among the six
+    states: npt.NDArray[np.intp]  # positions of the channel's states among all
     motion: Motion  # bound to the chains
     turns: tuple[int, ...]  # states of the first chain that turn
     bank: Bank
@@ -111,11 +134,28 @@ class Channel:
             np.broadcast_to(cov, (k, *sizes, n, n)),
         )
 
-    def predicted(self, rows: _Rows, over: Matrices) -> "Channel":
-        """Copies of rows, numbered from 0, mixed and moved forward over intervals."""
+    def predicted(self, rows: _Rows, over: Matrices, fade: _Array) -> "Channel":
+        """Copies of rows, numbered from 0, mixed and moved forward; what lasts of lasting errors is `fade` (k, slots).
+
+        The matrices are the caller's own: those of lasting errors are written into them.
+        """
         ahead = self.bank.take(rows)
+        at = np.flatnonzero(self.states >= MOTION)
+        if len(at):
+            each = fade.reshape(len(rows), *(1 for _ in self.chains), len(at))
+            over.F[..., at, at], over.Q[..., at, at] = each, 1.0 - each * each
         ahead.step(np.arange(len(rows)), over.trans, over.F, None, over.Q)
         return replace(self, bank=ahead)
+
+    def widened(self, slots: int, more: int) -> "Channel":
+        """Return the channel with more states of lasting errors, `slots` in all, N(0, 1) in every row."""
+        if 0 not in self.axes or not more:
+            return self
+        return replace(
+            self,
+            states=np.append(self.states, np.arange(MOTION + slots - more, MOTION + slots)),
+            bank=self.bank.widened(more),
+        )
 
     def score(self, rows: _Rows, plan: Plan, covs: _Array) -> _Array:
         """Log-likelihood of what this channel measures under h covariances (k, h, m, m) of each measurement, (k, h)."""
@@ -148,27 +188,51 @@ class Kinematics:
 
     channels: tuple[Channel, ...]
     intervals: Intervals  # of the channels
+    colours: Colours  # whose lasting errors the states behind the motion's are
+
+    def adopt(self, sources: Sequence[Colour], settings: TrackerSettings) -> "Kinematics":
+        """Return the same rows, with room for the lasting errors of further sources."""
+        before = self.colours.slots
+        self.colours.adopt(sources, settings)
+        more = self.colours.slots - before
+        if not more:
+            return self
+        channels = tuple(channel.widened(self.colours.slots, more) for channel in self.channels)
+        return _kinematics(channels, self.colours)
 
     def state(self) -> dict[str, Any]:
-        """Return what `restore` goes on from, by channel."""
-        return {str(k): channel.bank.state() for k, channel in enumerate(self.channels)}
+        """Return what `restore` goes on from: by channel, and whose the states of lasting errors are."""
+        banks = {str(k): channel.bank.state() for k, channel in enumerate(self.channels)}
+        return banks | {"colours": self.colours.state()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Hold the rows that `state` gave, of filters of the same settings."""
         for k, channel in enumerate(self.channels):
             channel.bank.restore(state[str(k)])
+        self.colours.restore(state["colours"])
 
     def add(self, start: Start) -> _Rows:
         """Store new rows."""
+        start = self._whole(start)
         first, *others = [channel.bank.add(channel.belief(start)) for channel in self.channels]
         if any((rows != first).any() for rows in others):
             raise NumericalError("internal: banks used alike gave rows of different numbers")
+        self._own(first, start)
         return first
 
     def write(self, rows: _Rows, start: Start) -> None:
         """Begin rows anew."""
+        start = self._whole(start)
         for channel in self.channels:
             channel.bank.write(rows, channel.belief(start))
+        self._own(rows, start)
+
+    def _whole(self, start: Start) -> Start:
+        return start if start.colours is not None else start.beside(self.colours.empty(len(start.mean)))
+
+    def _own(self, rows: _Rows, start: Start) -> None:
+        if start.colours is not None:
+            self.colours.put(rows, start.colours, np.arange(len(rows)))
 
     def move(self, rows: _Rows, shift: _Array, turn: _Array) -> None:
         """Move the frame of rows: positions by `shift` (k, 2), m; velocities turn anticlockwise by `turn` (k,), rad."""
@@ -189,10 +253,24 @@ class Kinematics:
         for channel in self.channels:
             channel.bank.remove(rows)
 
-    def predicted(self, rows: _Rows, dt: _Array) -> "Kinematics":
-        """Copies of rows (repeats allowed), numbered from 0, moved forward by dt >= 0."""
+    def predicted(self, rows: _Rows, dt: _Array, source: int = NO_SOURCE, time: _Array | None = None) -> "Kinematics":
+        """Copies of rows (repeats allowed), numbered from 0, moved forward by dt >= 0.
+
+        Args:
+            rows: which.
+            dt: (k,), s.
+            source: one that reports all of them and may take states for its lasting errors.
+            time: of its reports, (k,), s.
+        """
+        colours = self.colours.take(rows)
+        before = colours.owner
+        if source != NO_SOURCE and time is not None:
+            before = before.copy()
+            colours.claim(source, time)
+        fade = colours.fade(dt, before)
         parts = zip(self.channels, self.intervals.at(dt), strict=True)
-        return Kinematics(tuple(channel.predicted(rows, over) for channel, over in parts), self.intervals)
+        channels = tuple(channel.predicted(rows, over, fade) for channel, over in parts)
+        return Kinematics(channels, self.intervals, colours)
 
     def absorb(self, rows: _Rows, copies: "Kinematics", chosen: "Chosen") -> None:
         """Make of each row the mixture of its hypotheses, each a copy of the row conditioned on a measurement.
@@ -206,6 +284,7 @@ class Kinematics:
         log_weights = chosen.log_weights + sum(log_f for _, log_f in parts)
         for channel, (conditioned, _) in zip(self.channels, parts, strict=True):
             channel.bank.merge(rows, conditioned, chosen.start, log_weights)
+        self.colours.put(rows, copies.colours, chosen.copy[chosen.start[:-1]])
 
     def score(self, rows: _Rows, plan: Plan, covs: _Array) -> _Array:
         """Return log-likelihoods of measurements under each of h covariances (k, h, m, m); repeats allowed.
@@ -221,7 +300,7 @@ class Kinematics:
         P + sum_t d_t d_t' / n over the n turns t: the most agile mode's covariance P, and the distances d_t of the
         means in turns from its own.
         """
-        mean, cov = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6))
+        mean, cov = self._empty(len(rows))
         for channel in self.channels:
             s = channel.states
             belief = channel.bank.read(rows)
@@ -236,10 +315,23 @@ class Kinematics:
         """Overwrite rows with those of a set of copies."""
         for mine, theirs in zip(self.channels, other.channels, strict=True):
             mine.bank.put(rows, theirs.bank, other_rows)
+        self.colours.put(rows, other.colours, other_rows)
 
     def moments(self, rows: _Rows) -> Moments:
-        """Mean, covariance, and the probability of any state but the first of each chain."""
-        mean, cov = np.zeros((len(rows), 6)), np.zeros((len(rows), 6, 6))
+        """Mean, covariance, and the probability of any state but the first of each chain: what is published."""
+        mean, cov, p_manoeuvre = self._mixture(rows)
+        return Moments(mean[:, :MOTION], cov[:, :MOTION, :MOTION], p_manoeuvre["horizontal"], p_manoeuvre["vertical"])
+
+    def mixture(self, rows: _Rows) -> tuple[_Array, _Array]:
+        """Mean and covariance of motion and lasting errors."""
+        return self._mixture(rows)[:2]
+
+    def _empty(self, k: int) -> tuple[_Array, _Array]:
+        n = MOTION + self.colours.slots
+        return np.zeros((k, n)), np.zeros((k, n, n))
+
+    def _mixture(self, rows: _Rows) -> tuple[_Array, _Array, dict[str, _Array]]:
+        mean, cov = self._empty(len(rows))
         p_manoeuvre = {}
         for channel in self.channels:
             s = channel.states
@@ -247,13 +339,26 @@ class Kinematics:
             for c, chain in enumerate(channel.chains):
                 others = tuple(1 + i for i in range(len(channel.chains)) if i != c)
                 p_manoeuvre[chain.name] = 1.0 - probs.sum(axis=others)[:, 0]
-        return Moments(mean, cov, p_manoeuvre["horizontal"], p_manoeuvre["vertical"])
+        return mean, cov, p_manoeuvre
 
 
-def make_kinematics(settings: FilterSettings) -> Kinematics:
-    """Build the empty filters that the settings describe."""
+def make_kinematics(
+    settings: FilterSettings, sources: Sequence[Colour] = (), tracker: TrackerSettings | None = None
+) -> Kinematics:
+    """Build the empty filters that the settings describe.
+
+    Args:
+        settings: motion.
+        sources: the lasting errors of each source.
+        tracker: how many states may stand for those.
+    """
+    kinematics = _of_motion(settings)
+    return kinematics if tracker is None else kinematics.adopt(sources, tracker)
+
+
+def _of_motion(settings: FilterSettings) -> Kinematics:
     kind: Literal["scan", "white"] = "white" if settings.accel_time else "scan"
-    h, v = horizontal_chain(settings), vertical_chain(settings)
+    h, v, none = horizontal_chain(settings), vertical_chain(settings), Colours((), TrackerSettings())
     turn = (
         (lambda horizontal: horizontal.turn) if any(isinstance(mode, Mode) and mode.turn for mode in h.values) else None
     )
@@ -264,14 +369,15 @@ def make_kinematics(settings: FilterSettings) -> Kinematics:
             kind=kind,
             turn=turn,
         )
-        return _kinematics(_channel([0, 1, 2], (h, v), motion))
+        return _kinematics((_channel([0, 1, 2], (h, v), motion),), none)
     horizontal = constant_velocity(2, accel=lambda horizontal: horizontal.accel, kind=kind, turn=turn)
     vertical = constant_velocity(1, accel=lambda vertical: vertical.accel, kind=kind)
-    return _kinematics(_channel([0, 1], (h,), horizontal), _channel([2], (v,), vertical))
+    return _kinematics((_channel([0, 1], (h,), horizontal), _channel([2], (v,), vertical)), none)
 
 
-def _kinematics(*channels: Channel) -> Kinematics:
-    return Kinematics(channels, Intervals([(channel.motion, channel.chains) for channel in channels]))
+def _kinematics(channels: tuple[Channel, ...], colours: Colours) -> Kinematics:
+    parts = [(channel.motion, channel.chains, int((channel.states >= MOTION).sum())) for channel in channels]
+    return Kinematics(channels, Intervals(parts), colours)
 
 
 def _channel(axes: list[int], chains: tuple[Chain, ...], motion: Motion) -> Channel:
@@ -282,10 +388,13 @@ def _channel(axes: list[int], chains: tuple[Chain, ...], motion: Motion) -> Chan
     return Channel(np.array(axes), chains, states, motion.bind(chains), turns, bank)
 
 
-def two_point_start(first: _Array, first_cov: _Array, second: _Array, second_cov: _Array, dt: _Array) -> Start:
+def two_point_start(
+    first: _Array, first_cov: _Array, second: _Array, second_cov: _Array, dt: _Array, common: _Array | None = None
+) -> Start:
     """Begin states from two positions.
 
-    Position z1, velocity (z1 - z0)/T, and blockwise over (position, velocity) P = [[R1, R1/T], [R1/T, (R0 + R1)/T^2]].
+    Position z1, velocity (z1 - z0)/T, and blockwise over (position, velocity)
+    P = [[R1, (R1 - C)/T], [(R1 - C)'/T, (R0 + R1 - C - C')/T^2]], C = cov(error of z1, error of z0).
 
     Args:
         first: positions (x, y, z) at the earlier time, (k, 3).
@@ -293,18 +402,20 @@ def two_point_start(first: _Array, first_cov: _Array, second: _Array, second_cov
         second: positions at the later time, (k, 3).
         second_cov: their covariances R1, (k, 3, 3).
         dt: time between them T > 0, (k,), s.
+        common: C, (k, 3, 3); None: 0, each position errs by itself.
 
     Returns:
         States (x, vx, y, vy, z, vz) at the later time.
 
     Source: two-point differencing; section 3 of the radar notes.
     """
-    T = dt[:, None, None]
+    T, C = dt[:, None, None], np.zeros(second_cov.shape) if common is None else common
     mean, cov = np.empty((len(dt), 6)), np.empty((len(dt), 6, 6))
     mean[:, 0::2], mean[:, 1::2] = second, (second - first) / dt[:, None]
     cov[:, 0::2, 0::2] = second_cov
-    cov[:, 0::2, 1::2] = cov[:, 1::2, 0::2] = second_cov / T
-    cov[:, 1::2, 1::2] = (first_cov + second_cov) / (T * T)
+    cov[:, 0::2, 1::2] = (second_cov - C) / T
+    cov[:, 1::2, 0::2] = cov[:, 0::2, 1::2].swapaxes(1, 2)
+    cov[:, 1::2, 1::2] = (first_cov + second_cov - C - C.swapaxes(1, 2)) / (T * T)
     return Start(mean, cov)
 
 
@@ -315,7 +426,7 @@ def with_speed_prior(start: Start, sigma: float) -> Start:
     radars) tell no velocity; this keeps what is known of speeds, and changes nothing else.
 
     Args:
-        start: states (x, vx, y, vy, z, vz).
+        start: states (x, vx, y, vy, z, vz, ...).
         sigma: standard deviation of each component, m/s.
     """
     v = np.array([1, 3])
@@ -323,4 +434,5 @@ def with_speed_prior(start: Start, sigma: float) -> Start:
     S = start.cov[:, v[:, None], v] + sigma**2 * np.eye(2)
     gain = np.linalg.solve(S, U.swapaxes(-1, -2)).swapaxes(-1, -2)
     cov = start.cov - gain @ U.swapaxes(-1, -2)
-    return Start(start.mean - (gain @ start.mean[:, v, None])[..., 0], 0.5 * (cov + cov.swapaxes(-1, -2)))
+    mean = start.mean - (gain @ start.mean[:, v, None])[..., 0]
+    return start._replace(mean=mean, cov=0.5 * (cov + cov.swapaxes(-1, -2)))

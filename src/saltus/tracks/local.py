@@ -15,7 +15,7 @@ from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.rows import Assignments, Rows
 
-__all__ = ["LocalSystem", "Misfit", "Party", "foreign_systems", "group_sources", "local_system", "stated"]
+__all__ = ["LocalSystem", "Misfit", "Party", "foreign_systems", "group_sources", "local_system", "Stated"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]
@@ -95,7 +95,7 @@ def local_system(
     known = np.full(len(m), np.nan)
     known[rows.measurement[update]] = rows.time_known[update]
     known = np.where(np.isnan(known[at]), ready[track], known[at])  # a track's first plots, told with a later one
-    R = stated(m, at, velocity[at])
+    R = Stated().covariance(m, at, velocity[at], track)
     noise = float(np.sqrt(np.median(np.trace(R, axis1=-2, axis2=-1)) / 2.0)) if len(at) else np.inf
     R = R * Misfit().factor(track, m.time[at], m.position[at, :2], R)[:, None, None]
     icao24 = np.array([_commonest(m.icao24[at], track, k) for k in range(len(ids))], np.int64)
@@ -114,9 +114,42 @@ def local_system(
     return LocalSystem(name, view, mode3a if use_identity else hidden, label, ready, ids, at, noise, known, codes)
 
 
-def stated(m: Measurements, at: npt.NDArray[np.intp], velocity: _Array) -> _Array:
-    """Return the stated covariance of positions, (k, 2, 2), m^2; `velocity` (k, 2) is that of the targets, m/s."""
-    return np.asarray((m.cov[at] + m.stamped(at, velocity))[:, :2, :2] * m.inflation[at, None, None])
+class Stated:
+    """Covariances of positions by which all reports of a track together tell as much as they do.
+
+    Of errors with the correlation a^|k| between reports k intervals dt apart, a = exp(-dt / tau), the mean of many has
+    (1 + a) / (1 - a) = coth(dt / 2 tau) times the variance of as many independent ones: so much the variance of what
+    lasts counts in each report but the first of its source.
+    """
+
+    def __init__(self) -> None:
+        """Begin without reports."""
+        self._last: dict[tuple[int, int], float] = {}  # time of the last one by track and source
+
+    def covariance(self, m: Measurements, at: npt.NDArray[np.intp], velocity: _Array, track: _Index) -> _Array:
+        """Return those of the next reports, (k, 2, 2), m^2.
+
+        Args:
+            m: measurements.
+            at: which, time not decreasing within a track, (k,).
+            velocity: of their targets, (k, 2), m/s.
+            track: of each, (k,).
+        """
+        R, lasting = (m.cov[at] + m.stamped(at, velocity))[:, :2, :2], m.lasting[at]
+        if not lasting.any():
+            return np.asarray(R)
+        dt = np.full(len(at), np.inf)
+        for k, key in enumerate(zip(track.tolist(), m.source[at].tolist(), strict=True)):
+            time = float(m.time[at[k]])
+            dt[k] = time - self._last.get(key, -np.inf)
+            self._last[key] = time
+        dt[dt <= 0.0] = np.inf
+        again = 1.0 / np.tanh(0.5 * dt / m.lasting_time[at]) - 1.0
+        return np.asarray(R + again[:, None, None] * (lasting @ lasting.swapaxes(1, 2)))
+
+    def forget(self, before: float) -> None:
+        """Forget reports before a time, s: of tracks that are over."""
+        self._last = {key: time for key, time in self._last.items() if time >= before}
 
 
 class Misfit:

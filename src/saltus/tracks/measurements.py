@@ -46,8 +46,9 @@ class Noise:
     """Standard deviations of one source's measurements: m, rad, m/s and s, each report's error by itself.
 
     `time` is that of the time stamps: a position is where the target was a little sooner or later.
-    `inflation` multiplies their squares where a report updates a filter: errors that last from report to report tell
-    less than as many independent ones. Gates do without it.
+    `lasting` is that of errors that last from report to report, correlated as exp(-|s| / lasting_time): of the azimuth
+    of a radar or camera, rad, else of a position, each axis, m; at a distance d from the sensor it is
+    sqrt(1 + (d / lasting_distance)^2) times as large.
     """
 
     range: float = _RANGE
@@ -57,7 +58,9 @@ class Noise:
     altitude: float = _ALTITUDE
     range_rate: float = _RANGE_RATE
     time: float = 0.0
-    inflation: float = 1.0
+    lasting: float = 0.0
+    lasting_time: float = 60.0
+    lasting_distance: float = float("inf")
 
 
 def default_noise(source: Source) -> Noise:
@@ -83,7 +86,7 @@ class Measurements:
     time: _Array  # (N,), s
     source: npt.NDArray[np.int32]  # (N,)
     position: _Array  # (N, 3): plane x, y and altitude, m; altitude NaN where unknown
-    cov: _Array  # (N, 3, 3), m^2; row and column of an unknown altitude are those of the unit matrix
+    cov: _Array  # (N, 3, 3), m^2, of all errors; row and column of an unknown altitude are those of the unit matrix
     icao24: npt.NDArray[np.int32]
     mode3a: npt.NDArray[np.int16]
     callsign: npt.NDArray[Any]  # "" none
@@ -95,9 +98,10 @@ class Measurements:
     lever: _Array  # (N, 2): change of plane position per metre of height error, 0 where none
     origin: _Array  # (N, 2): plane x, y of the observer of a bearing, m; NaN where there is a position instead
     bearing: _Array  # (N,): rad from the plane's y axis, clockwise; NaN likewise
-    sigma_bearing: _Array  # (N,): rad; NaN likewise
+    sigma_bearing: _Array  # (N,): of all errors, rad; NaN likewise
     jitter: _Array  # (N,): standard deviation of the time stamp, s
-    inflation: _Array  # (N,): of the variance, where a measurement updates a filter
+    lasting: _Array  # (N, 2, 2): errors that last are L u in the plane, var u = I, m; of a bearing L[0, 0] u_0, rad
+    lasting_time: _Array  # (N,): correlation time of u, s
 
     def __len__(self) -> int:
         """Number of measurements."""
@@ -225,7 +229,7 @@ def place_plots(
     n = len(usable)
     position, cov = np.full((n, 3), np.nan), np.zeros((n, 3, 3))
     lever, ray = np.zeros((n, 2)), np.full((n, 2), np.nan)
-    sights = np.full((n, 4), np.nan)
+    sights, lasting = np.full((n, 4), np.nan), np.zeros((n, 2, 2))
     moved = np.isfinite(plots.observer_latitude[usable])
     kinds = (Kind.POLAR, Kind.PLANE, Kind.GEODETIC, Kind.BEARING)
     for s, kind, moves in product(range(len(plots.sources)), kinds, (False, True)):
@@ -235,13 +239,18 @@ def place_plots(
         own = plots.take(usable[at])
         if kind == Kind.BEARING:
             sights[at] = _sights(own, plane, sites[s], noise[s])
+            lasting[at, 0, 0] = noise[s].lasting
         else:
             prior = _height_prior(plots.sources[s], sites[s], height_prior)
             placed = _place(own, kind, plane, sites[s], noise[s], prior)
             _fill(position, cov, lever, at, placed)
             site = _site(own, sites[s])
+            seen = placed.xy if site is None else placed.xy - plane.forward(site.latitude, site.longitude)
             if kind == Kind.POLAR and site is not None:
-                ray[at] = placed.xy - plane.forward(site.latitude, site.longitude)
+                ray[at] = seen
+            lasting[at] = _lasting(seen, noise[s], polar=kind == Kind.POLAR)
+    sights[:, 3] = np.hypot(sights[:, 3], lasting[:, 0, 0])
+    cov[:, :2, :2] += lasting @ lasting.swapaxes(1, 2)
     return Measurements(
         plot=usable,
         time=plots.time[usable],
@@ -261,8 +270,26 @@ def place_plots(
         bearing=sights[:, 2],
         sigma_bearing=sights[:, 3],
         jitter=np.where(np.isnan(ray[:, 0]), _of_sources(plots.source[usable], noise, "time"), 0.0),
-        inflation=_of_sources(plots.source[usable], noise, "inflation"),
+        lasting=lasting,
+        lasting_time=_of_sources(plots.source[usable], noise, "lasting_time"),
     )
+
+
+def _lasting(seen: _Array, noise: Noise, *, polar: bool) -> _Array:
+    """Return L of positions (k, 2, 2): across the ray where the source is polar, else along both axes.
+
+    Args:
+        seen: positions from the site, (k, 2), m; without a site from the middle of the plane.
+        noise: of the source.
+        polar: whether it measures an azimuth.
+    """
+    scale = noise.lasting * np.sqrt(1.0 + np.square(seen).sum(axis=1) / noise.lasting_distance**2)
+    out = np.zeros((len(seen), 2, 2))
+    if polar:
+        out[:, 0, 0], out[:, 1, 0] = -seen[:, 1] * scale, seen[:, 0] * scale
+    else:
+        out[:, 0, 0] = out[:, 1, 1] = scale
+    return out
 
 
 def _of_sources(source: npt.NDArray[np.int32], noise: Mapping[int, Noise], name: str) -> _Array:

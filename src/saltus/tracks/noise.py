@@ -9,11 +9,12 @@ import numpy.typing as npt
 from saltus.records import Source
 from saltus.tracks.measurements import Measurements, Noise
 
-__all__ = ["LEAST", "NoiseEstimate", "apply_estimate", "estimate_noise", "widened"]
+__all__ = ["LEAST", "LEAST_ANGLE", "NoiseEstimate", "apply_estimate", "estimate_noise", "widened"]
 
 _Array = npt.NDArray[np.float64]
 
-LEAST, _AT = 0.01, 5e3  # m, and m of range: what an aircraft flies while no clock of a sensor tells the time better
+LEAST = 0.01  # m: what an aircraft flies while no clock of a sensor tells the time better
+LEAST_ANGLE = LEAST / 5e3  # rad: the same at a range of 5 km
 
 _WINDOW, _INNER = 7, 5  # plots of one track; of what climbs bend as turns do positions, which no window leaves out
 _STEP = 2.0  # s, some, between those of a position: in less, what an aircraft's position errs by looks like a turn
@@ -164,8 +165,8 @@ def apply_estimate(noise: Noise, estimate: NoiseEstimate, source: Source) -> Noi
     return replace(
         noise,
         range=at_least(estimate.range, source.range_lsb, noise.range),
-        azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth, LEAST / _AT),
-        elevation=at_least(estimate.elevation, source.elevation_lsb, noise.elevation, LEAST / _AT),
+        azimuth=at_least(estimate.azimuth, source.azimuth_lsb, noise.azimuth, LEAST_ANGLE),
+        elevation=at_least(estimate.elevation, source.elevation_lsb, noise.elevation, LEAST_ANGLE),
         range_rate=at_least(estimate.range_rate, source.range_rate_lsb, noise.range_rate),
         xy=at_least(estimate.xy, source.xy_lsb, noise.xy),
         time=estimate.time if np.isfinite(estimate.time) else noise.time,

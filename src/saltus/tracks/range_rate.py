@@ -32,13 +32,13 @@ def rate_of(mean: _Array, offset: _Array, site: _Array, cosine: _Array) -> tuple
         h = cos(e) u'v + sin(e) v_z,   dh/dv = cos(e) u,   dh/dp = cos(e) (v - (u'v) u) / |d|.
 
     Args:
-        mean: states (x, vx, y, vy, z, vz), (k, 6).
+        mean: states (x, vx, y, vy, z, vz, ...), (k, n).
         offset: s from their time to the report's, (k,).
         site: plane x, y, m, (k, 2).
         cosine: of the elevation, (k,).
 
     Returns:
-        h (k,), m/s, and the row C (k, 6) of its derivatives; that by v_z is left to the noise, and 0 in it.
+        h (k,), m/s, and the row C (k, n) of its derivatives; that by v_z is left to the noise, and 0 in it.
     """
     v = mean[:, 1:4:2]
     d = mean[:, 0:3:2] + offset[:, None] * v - site
@@ -76,13 +76,13 @@ def with_range_rates(
     rate = m.range_rate[plot]
     told = np.isfinite(rate) & np.isfinite(cosine)
     site, cosine = np.where(told[:, None], site, 0.0), np.where(told, cosine, 1.0)
-    moments = copies.moments(rows)
-    value, C = rate_of(moments.mean, offset, site, cosine)
-    variance = m.sigma_range_rate[plot] ** 2 + (1.0 - cosine**2) * moments.cov[:, 5, 5]
+    expected, spread = copies.mixture(rows)
+    value, C = rate_of(expected, offset, site, cosine)
+    variance = m.sigma_range_rate[plot] ** 2 + (1.0 - cosine**2) * spread[:, 5, 5]
     mean, cov = copies.widest(rows)
     nu = rate - rate_of(mean, offset, site, cosine)[0]
     used = told & (nu**2 <= limit * (np.einsum("ki,kij,kj->k", C, cov, C) + variance))
-    z = np.where(used, rate - value + (C * moments.mean).sum(axis=-1), np.nan)
+    z = np.where(used, rate - value + (C * expected).sum(axis=-1), np.nan)
     wide = np.zeros((*covs.shape[:2], _AT + 1, _AT + 1))
     wide[..., :_AT, :_AT] = covs
     wide[..., _AT, _AT] = np.where(used, variance, 1.0)[:, None]

@@ -108,6 +108,9 @@ class TrackerSettings:
         degraded_noise: factor of the standard deviations of a degraded source: of azimuth or range or both, or of
             position; 1 = no source degrades.
         degraded_sojourn: mean time that a source is well, and degraded, s.
+        lasting_states: states beside position and velocity that a track has for errors that last, two for a source of
+            positions, one for a radar; where they do not suffice, such errors are taken for noise.
+        lasting_silence: correlation times that a source must have been silent before its states are another's.
         height_prior: mean and standard deviation of the height of targets that do not tell it, m; what a surface
             movement sensor (CAT010) sees is taken to stand on the ground.
         sigma_pressure: error of pressure altitude as geometric height, m; widens the published covariance near
@@ -134,6 +137,8 @@ class TrackerSettings:
     outlier_xy: float = 200.0
     degraded_noise: float = 5.0
     degraded_sojourn: tuple[float, float] = (7200.0, 60.0)
+    lasting_states: int = 4
+    lasting_silence: float = 5.0
     height_prior: tuple[float, float] = (5000.0, 3500.0)
     sigma_pressure: float = 100.0
 
@@ -152,6 +157,8 @@ class TrackerSettings:
                 f"tracker.confirm_hits of confirm_scans (M of N) needs 1 <= M <= N <= 32, "
                 f"got {self.confirm_hits} of {self.confirm_scans}."
             )
+        if self.lasting_states < 0:
+            raise ModelError(f"tracker.lasting_states is a number of states, 0 for none, got {self.lasting_states}.")
         if self.most_candidates < 1:
             raise ModelError(f"tracker.most_candidates is a number of plots, 1 or more, got {self.most_candidates}.")
         positive = ("clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds", "split_range")

@@ -6,9 +6,10 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.tracks.associate import Pairs
+from saltus.tracks.colour import NO_SOURCE
 from saltus.tracks.faults import SourceCondition
 from saltus.tracks.gates import Gate, Gated
-from saltus.tracks.kinematics import Kinematics, Plan
+from saltus.tracks.kinematics import MOTION, Kinematics, Plan
 from saltus.tracks.lifecycle import CONFIRMED, Lifecycle
 from saltus.tracks.measurements import Measurements
 
@@ -29,6 +30,9 @@ class _Line(NamedTuple):
     rho: _Array  # (P,): distance along it, m
     aside: _Array  # (P,): distance across it, m
     variance: _Array  # (P,): of that, of the track alone, m^2
+    C: _Array  # (P, 6 + slots): how the states enter
+    carried: _Array  # (P,): variance of the bearing that states stand for, rad^2
+    lasting: _Array  # (P,): variance of lasting errors that none stands for, rad^2
 
 
 def sight(
@@ -47,8 +51,8 @@ def sight(
 
         0 = c'(x - o) + rho v,   innovation -c'(y - o),  variance c'P c + (rho sigma)^2.
 
-    It is exact in the angle (no wrapping is met); sigma is that of every hypothesis of the source, and the filter takes
-    the variance times the source's inflation.
+    It is exact in the angle (no wrapping is met); sigma is that of every hypothesis of the source. Where the track has
+    a state u for the source's lasting errors of deviation L, v = L u + the rest.
 
     Args:
         kinematics: the filters of all tracks.
@@ -66,7 +70,8 @@ def sight(
     plot = index[near.plot]
     line = _line(kinematics, life, m, near.track, plot)
     limit = np.where(source.law.fault[live] > 0, gate.fault_bearing, gate.height)
-    S = line.variance[:, None] + line.rho[:, None] ** 2 * source.law.angular(m.sigma_bearing[plot], live)
+    angular = source.law.angular(m.sigma_bearing[plot], live) - line.carried[:, None]
+    S = line.variance[:, None] + line.rho[:, None] ** 2 * angular
     inside = np.flatnonzero((line.rho > 0.0) & (line.aside[:, None] ** 2 <= limit * S).any(axis=1))
     return _gated(line, Pairs(near.track[inside], near.plot[inside]), inside, m, plot[inside], source)
 
@@ -84,34 +89,40 @@ def sighted(
 
 
 def _line(kinematics: Kinematics, life: Lifecycle, m: Measurements, track: _Index, plot: _Index) -> _Line:
-    dt = m.time[plot] - life.time[track]
+    dt, source = m.time[plot] - life.time[track], int(m.source[plot[0]]) if len(plot) else NO_SOURCE
     offset = np.minimum(dt, 0.0)
-    copies = kinematics.predicted(track, np.maximum(dt, 0.0))
+    copies = kinematics.predicted(track, np.maximum(dt, 0.0), source, m.time[plot])
     u, c = _directions(m.bearing[plot])
     mean, cov = copies.widest(np.arange(len(plot)))
-    P = cov[:, :3:2, :3:2]  # the offset of a late bearing is too short to matter here
     rho, aside = _along(mean, offset, m.origin[plot], u), _along(mean, offset, m.origin[plot], c)
-    return _Line(copies, offset, c, rho, aside, np.einsum("ki,kij,kj->k", c, P, c))
+    C, effect = np.zeros(mean.shape), m.lasting[plot]
+    C[:, :3:2], C[:, 1:4:2] = c, offset[:, None] * c
+    C[:, MOTION:] = rho[:, None] * copies.colours.columns(source, effect)[:, 0]
+    carried = copies.colours.carried(source, effect)[:, 0, 0]
+    aside = aside + (C[:, MOTION:] * mean[:, MOTION:]).sum(axis=1)
+    variance = np.einsum("ki,kij,kj->k", C, cov, C)
+    return _Line(copies, offset, c, rho, aside, variance, C, carried, effect[:, 0, 0] ** 2 - carried)
 
 
 def _gated(line: _Line, pairs: Pairs, inside: _Index, m: Measurements, plot: _Index, source: SourceCondition) -> Gated:
-    c, rho, offset = line.across[inside], line.rho[inside], line.offset[inside]
-    mixture = line.copies.moments(inside)
-    P = mixture.cov[:, :3:2, :3:2]
-    variance = rho[:, None] ** 2 * source.law.angular(m.sigma_bearing[plot])
-    d2 = _along(mixture.mean, offset, m.origin[plot], c) ** 2 / (np.einsum("ki,kij,kj->k", c, P, c) + variance[:, 0])
-    z, C = np.full((len(inside), 3), np.nan), np.zeros((len(inside), 3, 6))
-    z[:, 0] = (c * m.origin[plot]).sum(axis=-1)
-    C[:, 0, :3:2], C[:, 0, 1:4:2] = c, offset[:, None] * c
+    c, rho, offset, row = line.across[inside], line.rho[inside], line.offset[inside], line.C[inside]
+    mean, cov = line.copies.mixture(inside)
+    far = rho[:, None] ** 2
+    variance = far * (source.law.angular(m.sigma_bearing[plot]) - line.carried[inside, None])
+    aside = (row * mean).sum(axis=1) - (c * m.origin[plot]).sum(axis=1)
+    d2 = aside**2 / (np.einsum("ki,kij,kj->k", row, cov, row) + variance[:, 0])
+    z, C = np.full((len(inside), 3), np.nan), np.zeros((len(inside), 3, row.shape[1]))
+    z[:, 0], C[:, 0] = (c * m.origin[plot]).sum(axis=-1), row
     covs = np.tile(np.eye(3), (*variance.shape, 1, 1))
-    covs[..., 0, 0] = variance * m.inflation[plot, None]
+    again = line.copies.colours.again(int(m.source[plot[0]])) if len(plot) else 0.0
+    covs[..., 0, 0] = variance + again * far * line.lasting[inside, None]
     return Gated(
         pairs,
         Plan(z, C),
         covs,
         np.log(rho),
-        mixture.mean[:, :3:2] + offset[:, None] * mixture.mean[:, 1:4:2],
-        P,
+        mean[:, :3:2] + offset[:, None] * mean[:, 1:4:2],
+        cov[:, :3:2, :3:2],
         d2,
         np.zeros(len(inside), bool),
         line.copies,

@@ -3,7 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.kinematics import Start, two_point_start, with_speed_prior
+from saltus.tracks.colour import Colours
+from saltus.tracks.kinematics import MOTION, Start, two_point_start, with_speed_prior
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
@@ -26,22 +27,37 @@ class Starts:
         sojourn = np.array(filters.sojourn_h)
         self._mean_accel_sq = float(sojourn @ np.square(filters.accel_h) / sojourn.sum())
 
-    def of_one(self, m: Measurements, plots: _Index) -> Start:
-        """States of tracks with one plot each: at rest."""
+    def of_one(self, m: Measurements, plots: _Index, colours: Colours) -> Start:
+        """States of tracks with one plot each: at rest, off the plot by the opposite of its lasting error.
+
+        Args:
+            m: measurements.
+            plots: the plot of each track.
+            colours: a table without rows, of all sources.
+        """
         mean, cov = np.zeros((len(plots), 6)), np.zeros((len(plots), 6, 6))
         mean[:, 0::2], cov[:, 0::2, 0::2] = m.with_height(plots, self._settings.height_prior)
         cov[:, [1, 3], [1, 3]] = self._speed**2
         cov[:, 5, 5] = _CLIMB**2
-        return Start(mean, cov)
+        colours, cross = colours.empty(len(plots)), np.zeros((len(plots), MOTION, colours.slots))
+        cross[:, :3:2] = -colours.claim_each(m.source[plots], m.time[plots], m.lasting[plots])
+        return Start(mean, cov).beside(colours, cross)
 
-    def of_two(self, before: Measurements, time: _Array, m: Measurements, plots: _Index) -> Start:
+    def of_two(self, before: Measurements, time: _Array, m: Measurements, plots: _Index, colours: Colours) -> Start:
         """States of tracks that found their second plot.
+
+        With lasting errors L_0 u_0 and L_1 u_1 of the two plots, and a = exp(-T / tau), where one source gave both
+
+            cov(e_1, e_0) = a L_1 L_0',   cov(x, u) = -L_1,   cov(v, u) = -(L_1 - a L_0) / T,
+
+        and where two did, of the first one cov(v, u_0) = a L_0 / T.
 
         Args:
             before: the first plot of each track, (k,).
             time: of the tracks, s.
             m: measurements.
             plots: the second plot of each track.
+            colours: a table without rows, of all sources.
         """
         every, prior = np.arange(len(plots)), self._settings.height_prior
         dt = m.time[plots] - time
@@ -50,15 +66,23 @@ class Starts:
         velocity = way / np.maximum(dt, slowest)[:, None]
         (z0, R0), (z1, R1) = before.with_height(every, prior), m.with_height(plots, prior)
         R0, R1 = R0 + before.stamped(every, velocity), R1 + m.stamped(plots, velocity)
-        start = with_speed_prior(two_point_start(z0, R0, z1, R1, dt), self._settings.max_speed)
+        one, common = (before.source == m.source[plots])[:, None, None], np.zeros(R0.shape)
+        a = colours.correlation(before.source, dt)[:, None, None]
+        common[:, :2, :2] = np.where(one, a * (m.lasting[plots] @ before.lasting.swapaxes(1, 2)), 0.0)
+        start = two_point_start(z0, R0, z1, R1, dt, common)
+        colours, cross = colours.empty(len(plots)), np.zeros((len(plots), MOTION, colours.slots))
+        L0 = colours.claim_each(before.source, time, before.lasting)
+        L1 = colours.claim_each(m.source[plots], m.time[plots], m.lasting[plots])
+        cross[:, :3:2], cross[:, 1:4:2] = -L1, (a * L0 - L1) / dt[:, None, None]
+        start = with_speed_prior(start.beside(colours, cross), self._settings.max_speed)
         # The target may have manoeuvred between the two.
         start.cov[:, [1, 3], [1, 3]] += self._mean_accel_sq * (0.5 * dt[:, None]) ** 2
-        one, other = np.isfinite(before.position[:, 2]), np.isfinite(m.position[plots, 2])
-        flat = np.flatnonzero(~(one & other))
+        earlier, other = np.isfinite(before.position[:, 2]), np.isfinite(m.position[plots, 2])
+        flat = np.flatnonzero(~(earlier & other))
         latest = other[flat]
         start.mean[flat, 4] = np.where(latest, z1[flat, 2], z0[flat, 2])
         start.mean[flat, 5] = 0.0
-        start.cov[flat, 4:, :] = start.cov[flat, :, 4:] = 0.0
+        start.cov[flat, 4:6, :] = start.cov[flat, :, 4:6] = 0.0
         start.cov[flat, 4, 4] = np.where(latest, R1[flat, 2, 2], R0[flat, 2, 2])
         start.cov[flat, 5, 5] = _CLIMB**2
         return start

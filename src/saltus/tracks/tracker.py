@@ -13,7 +13,7 @@ from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.kept import Kept
-from saltus.tracks.kinematics import make_kinematics
+from saltus.tracks.kinematics import MOTION, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.publish import Told, coast, updated_rows
@@ -54,7 +54,7 @@ class Tracker:
         """
         self._settings, self._filters = settings, filters
         self._use_identity = use_identity
-        self._kinematics = make_kinematics(filters)
+        self._kinematics = make_kinematics(filters, [s.colour for s in setup.sources], settings)
         self._life = Lifecycle(settings)
         self._sources: list[SourceCondition] = []
         self.adopt(setup)
@@ -67,6 +67,7 @@ class Tracker:
         self._setup = setup
         self._periods = np.array([s.period for s in setup.sources])
         self._gate = Gate(self._settings, self._filters, self._periods, use_identity=self._use_identity)
+        self._kinematics = self._kinematics.adopt([s.colour for s in setup.sources], self._settings)
         new = setup.sources[len(self._sources) :]
         self._sources += [SourceCondition(plot_law(self._settings, s.kind), self._settings) for s in new]
 
@@ -182,7 +183,9 @@ class Tracker:
         surplus = self._surplus(rows[right], plots[right])
         if new.any():
             first = self._last.of(rows[new])
-            self._kinematics.write(rows[new], self._starts.of_two(first, life.time[rows[new]], m, plots[new]))
+            begun = life.time[rows[new]]
+            start = self._starts.of_two(first, begun, m, plots[new], self._kinematics.colours)
+            self._kinematics.write(rows[new], start)
         absorb(self._kinematics, rows[~new], gated, chosen[~new], judged.take(~new))
         self._enter(rows, plots, wait, gated.height_used[chosen], sound=new | (wrong <= 0.5))
         life.p_fault[rows] = np.where(new, np.nan, wrong)
@@ -342,9 +345,10 @@ class Tracker:
         """Begin a track with every plot."""
         if not len(plots):
             return np.zeros(0, np.intp)
-        life, start = self._life, self._starts.of_one(m, plots)
+        life, start = self._life, self._starts.of_one(m, plots, self._kinematics.colours)
         rows = self._kinematics.add(start)
-        life.begin(rows, Birth(m.time[plots], np.full(len(plots), wait), m.plot[plots], *start))
+        state = start.mean[:, :MOTION], start.cov[:, :MOTION, :MOTION]
+        life.begin(rows, Birth(m.time[plots], np.full(len(plots), wait), m.plot[plots], *state))
         life.heard_altitude(rows, np.isfinite(m.position[plots, 2]), m.cov[plots, 2, 2])
         self._note(rows, m, plots)
         life.sound_time[rows], life.sound_source[rows] = m.time[plots], m.source[plots]

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from saltus.identify import LocalTracks
 from saltus.tracks.encounters import SystemTracks
-from saltus.tracks.local import LocalSystem, Misfit, stated
+from saltus.tracks.local import LocalSystem, Misfit, Stated
 from saltus.tracks.measurements import Measurements
 
 __all__ = ["Reported", "Window"]
@@ -63,7 +63,7 @@ class Window:
             use_identity: whether addresses and codes may be looked at.
         """
         self._name, self._confirmed, self._ready, self._use_identity = name, confirmed, ready, use_identity
-        self._misfit = Misfit()
+        self._stated, self._misfit = Stated(), Misfit()
         none, number = np.zeros(0), np.zeros(0, np.int64)
         pair, square = np.zeros((0, 2)), np.zeros((0, 2, 2))
         self._rows = _Rows(number, none, pair, square, pair, pair, none, none, np.zeros((0, 2), np.int64))
@@ -76,9 +76,10 @@ class Window:
         at = np.flatnonzero(np.isin(new.track, self._confirmed) & np.isfinite(m.position[:, 0]))
         at = at[np.lexsort((m.time[at], new.track[at]))]
         track, time, z = new.track[at], m.time[at], m.position[at, :2]
-        R = stated(m, at, velocity[at])
+        R = self._stated.covariance(m, at, velocity[at], track)
         R = R * self._misfit.factor(track, time, z, R)[:, None, None]
         if len(time):
+            self._stated.forget(float(time.max()) - _LONG_AGO)
             self._misfit.forget(float(time.max()) - _LONG_AGO)
         ready = self._ready[np.searchsorted(self._confirmed, track)]
         known = np.where(new.updated[at], new.known[at], ready)
