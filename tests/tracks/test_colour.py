@@ -13,7 +13,7 @@ from saltus.tracks.kinematics import Chosen, Start, make_kinematics
 from saltus.tracks.lifecycle import Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
-from saltus.tracks.starts import Starts
+from saltus.tracks.starts import Starts, erring
 
 Q = 0.3  # m^2/s^3
 ONE_MODE = FilterSettings(
@@ -173,3 +173,31 @@ def test_rows_keep_their_states_when_a_further_source_errs_with_memory(begun):
     ahead = wider.predicted(rows, np.ones(1), 2, np.ones(1)).mixture(np.arange(1))
     np.testing.assert_allclose(ahead[1][0, 6:, 6:], np.eye(3))
     np.testing.assert_array_equal(ahead[1][0, :6, 6:], 0.0)
+
+
+@pytest.mark.parametrize("reported", [2, 10, 60])
+def test_a_state_handed_on_errs_as_the_reports_it_came_from(reported):
+    """Cross covariances that `erring` makes of the motion's alone, against those of the filter that had them."""
+    times = np.arange(reported) + 1.0
+    m = reports(times, np.zeros(reported), np.zeros((reported, 2)))
+    kinematics = make_kinematics(ONE_MODE, SOURCES, SETTINGS)
+    begins = Starts(replace(SETTINGS, max_speed=1e4), ONE_MODE, 10.0)
+    start = begins.of_two(m.take(np.array([0])), times[:1], m, np.array([1]), kinematics.colours)
+    rows, life = kinematics.add(start), Lifecycle(SETTINGS)
+    life.begin(rows, Birth(times[1:2], np.ones(1), np.zeros(1, np.int64), start.mean[:, :6], start.cov[:, :6, :6]))
+    gate = Gate(SETTINGS, ONE_MODE, np.ones(3), use_identity=False)
+    for k in range(2, reported):
+        law = SourceCondition(plot_law(SETTINGS, 0), SETTINGS)
+        gated = gate.given(kinematics, life, m, rows, np.array([k]), law, np.zeros((1, 3, 3)))
+        kinematics.absorb(rows, gated.copies, Chosen.sure(gated.copy, gated.plan, gated.covs[:, 0]))
+        life.hit(rows, m.time[[k]], np.ones(1), np.array([k]))
+    mean, cov = kinematics.mixture(rows)
+    motion = Start(mean[:, :6], cov[:, :6, :6])
+    handed = erring(motion, kinematics.colours, m.source[-1:], m.time[-1:], m.lasting[-1:])
+    share = handed.cov[0, 0, 6] / cov[0, 0, 6]
+    assert 0.8 < share < 1.25
+    assert np.linalg.eigvalsh(handed.cov[0]).min() > 0.0
+    np.testing.assert_array_equal(handed.cov[0, :6, :6], cov[0, :6, :6])
+    # What follows p + L u has the reports' own uncertainty, and not that of the position.
+    H = np.hstack([[1.0, 0, 0, 0, 0, 0], L[0][0], np.zeros(1)])
+    assert np.sqrt(H @ handed.cov[0] @ H) < 0.5 * np.sqrt(cov[0, 0, 0])

@@ -8,11 +8,14 @@ from scipy.stats import chi2
 from tracking_scenes import measured
 
 from saltus.records import Kind
+from saltus.tracks.background import flat
+from saltus.tracks.colour import Colour
 from saltus.tracks.faults import plot_law
 from saltus.tracks.fuse import Candidates, Fusion
 from saltus.tracks.lifecycle import COASTED, CONFIRMED
 from saltus.tracks.rows import join_rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
+from saltus.tracks.sources import SourceSetup
 
 ONE_MODE = FilterSettings(
     accel_h=(0.5,), sojourn_h=(100.0,), turn_rate=(), accel_v=(0.2,), sojourn_v=(100.0,), accel_time=4.0
@@ -36,7 +39,9 @@ def candidates(m, track, state=None, *, sigma_p=20.0, sigma_v=10.0, every=False,
 
 def fused(m, given, filters=ONE_MODE, settings=NO_FAULT, *, kinds=(Kind.PLANE,), periods=None, width=1.0):
     laws = [plot_law(settings, kind) for kind in kinds]
-    fusion = Fusion(settings, filters, laws, periods or [4.0] * len(kinds), use_identity=True)
+    waits = periods or [4.0] * len(kinds)
+    sources = [SourceSetup(w, w, kind, flat(1e-9), Colour()) for w, kind in zip(waits, kinds, strict=True)]
+    fusion = Fusion(settings, filters, laws, sources, use_identity=True)
     slice_of = np.floor((m.time - m.time[0]) / width)
     out = [row for s in np.unique(slice_of) for row in fusion.feed(m, given.take(np.flatnonzero(slice_of == s)))]
     return join_rows(out), fusion.conditions

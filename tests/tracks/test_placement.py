@@ -15,7 +15,6 @@ from saltus.io.assemble import CATEGORIES
 from saltus.records import Kind, Plots, Source, System
 from saltus.tracks.local import local_system
 from saltus.tracks.measurements import Noise, default_noise, make_plane, place_plots
-from saltus.tracks.noise import LEAST
 from saltus.tracks.rows import Assignments, join_rows
 
 N = 30
@@ -126,10 +125,11 @@ def test_a_configured_correlation_time_is_that_of_the_deviation_given():
     radar = Source(System(48, 1, 2), CATEGORIES[48].traits, azimuth_lsb=1e-4)
     ship = Source(System(None, None, None, "ship"))
     given = given_noise(SensorConfig(name="ship", sigma_xy=2.0, correlation_time=5.0), ship)
-    assert (given["lasting"], given["xy"], given["lasting_time"]) == (2.0, LEAST, 5.0)
+    assert np.hypot(given["lasting"], given["xy"]) == pytest.approx(2.0)
+    assert (given["xy"], given["lasting_time"]) == (pytest.approx(0.4), 5.0)
     given = given_noise(SensorConfig(sac=1, sic=2, sigma_azimuth=0.1, sigma_range=9.0, correlation_time=5.0), radar)
-    assert (given["lasting"], given["range"]) == (np.radians(0.1), 9.0)
-    assert given["azimuth"] == pytest.approx(1e-4 / np.sqrt(12.0))
+    assert np.hypot(given["lasting"], given["azimuth"]) == pytest.approx(np.radians(0.1))
+    assert (given["azimuth"], given["range"]) == (pytest.approx(np.radians(0.02)), 9.0)
     given = given_noise(SensorConfig(name="ship", sigma_xy=2.0, sigma_lasting=7.0, lasting_scale_distance=9e3), ship)
     assert (given["lasting"], given["xy"], given["lasting_distance"]) == (7.0, 2.0, 9e3)
     assert "lasting" not in given_noise(SensorConfig(name="ship", sigma_xy=2.0), ship)

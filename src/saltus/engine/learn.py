@@ -13,8 +13,9 @@ from saltus.io.part import revisit
 from saltus.progress import Progress
 from saltus.records import Kind, Plots, Source
 from saltus.tracks.background import flat, learn_background
+from saltus.tracks.lasting import estimate_lasting, straight_pieces
 from saltus.tracks.measurements import Measurements, default_noise, make_plane, place_plots
-from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened
+from saltus.tracks.noise import NoiseEstimate, apply_estimate, estimate_noise, widened, with_lasting
 from saltus.tracks.periods import learn_period
 from saltus.tracks.rows import Rows, assignments
 from saltus.tracks.settings import TrackerSettings
@@ -134,25 +135,41 @@ def _kind(source: Source, kinds: npt.NDArray[np.int8]) -> int:
 
 
 def _with_noise(setup: Setup, plots: Plots, own: Sequence[int], bar: Progress) -> Setup:
-    """Estimate the noise of one system's sources from its own tracks, and widen it to what innovations say."""
+    """Estimate the noise of one system's sources from its own tracks, and widen it to what innovations say.
+
+    What lasts of the errors is estimated twice where there is any: tracks made with it tell manoeuvres from errors.
+    """
     if all(_configured(setup.sensors[s]) for s in own):
         return setup  # `finish` estimates it from the tracks that it has
-    m, _, found = _tracked(setup, plots, own, bar, "estimating noise")
+    m, rows, found = _tracked(setup, plots, own, bar, "estimating noise")
     before = _counted(m, found, len(setup.sensors))
     estimates = {s: estimate_noise(m, found, s) for s in own}
-    sensors = list(setup.sensors)
-    for s in own:
-        noise = replace(apply_estimate(sensors[s].noise, estimates[s], sensors[s].source), **sensors[s].given)
-        sensors[s] = replace(sensors[s], noise=noise, estimate=estimates[s])
-    estimated = replace(setup, sensors=tuple(sensors))
+    estimated = _estimated(setup, estimates, m, rows)
     m, rows, found = _tracked(estimated, plots, own, bar, "checking noise")
-    after = _counted(m, found, len(sensors))
+    if any(estimated.sensors[s].noise.lasting and "lasting" not in estimated.sensors[s].given for s in own):
+        estimated = _estimated(setup, estimates, m, rows)
+        m, rows, found = _tracked(estimated, plots, own, bar, "checking noise")
+    after, sensors = _counted(m, found, len(setup.sensors)), list(estimated.sensors)
     for s in own:
         if 2 * after[s] < before[s]:  # with its estimate it loses its tracks: they scatter less than they differ
             noise = setup.sensors[s].noise
         else:
             noise = replace(widened(sensors[s].noise, _steady_d2(rows, s)), **sensors[s].given)
         sensors[s] = replace(sensors[s], noise=noise)
+    return replace(setup, sensors=tuple(sensors))
+
+
+def _estimated(setup: Setup, estimates: Mapping[int, NoiseEstimate], m: Measurements, rows: Rows) -> Setup:
+    """Give sources the noise estimated, and what lasts of it, where nothing is configured."""
+    sensors, q = list(setup.sensors), setup.config.filter.steady_density
+    for s, estimate in estimates.items():
+        sensor, source = sensors[s], sensors[s].source
+        noise = apply_estimate(sensor.noise, estimate, source)
+        white = noise.azimuth if sensor.kind == Kind.POLAR else noise.xy
+        if sensor.may_last:
+            found = estimate_lasting(straight_pieces(m, rows, s, sensor.period), white, q)
+            estimate, noise = with_lasting(estimate, noise, found, source, polar=sensor.kind == Kind.POLAR)
+        sensors[s] = replace(sensor, noise=replace(noise, **sensor.given), estimate=estimate)
     return replace(setup, sensors=tuple(sensors))
 
 

@@ -13,12 +13,14 @@ from saltus.tracks.background import Background
 from saltus.tracks.colour import Colour
 from saltus.tracks.local import Party, group_sources
 from saltus.tracks.measurements import Measurements, Noise, place_plots
-from saltus.tracks.noise import LEAST, LEAST_ANGLE, NoiseEstimate
+from saltus.tracks.noise import NoiseEstimate
 from saltus.tracks.slices import slice_width
 from saltus.tracks.sources import SourceSetup, TrackerSetup
 
 __all__ = ["SensorSetup", "Setup", "given_noise", "site_of"]
 
+_STATES = {Kind.PLANE: 2, Kind.POLAR: 1, Kind.BEARING: 0}  # for lasting errors; one angle alone tells none of its own
+_OWN = 0.2  # of a deviation that is said to last: reports told as free of errors of their own would outweigh all others
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 
 
@@ -48,6 +50,16 @@ class SensorSetup:
         return SourceSetup(self.period, self.wait, self.kind, self.background, self.colour)
 
     @property
+    def may_last(self) -> bool:
+        """Whether lasting errors are looked for.
+
+        They are where one instrument gives azimuths or positions and nothing is configured of them. Where targets tell
+        their positions themselves each errs by its own means, and a source tells nothing of another target's.
+        """
+        given = {"lasting", "lasting_time", "azimuth" if self.kind == Kind.POLAR else "xy"}
+        return self.kind != Kind.BEARING and not self.source.traits.self_reporting and not given & set(self.given)
+
+    @property
     def colour(self) -> Colour:
         """Its errors that last.
 
@@ -59,7 +71,7 @@ class SensorSetup:
         if not noise.lasting:
             return Colour()
         inflation = float(1.0 / np.tanh(0.5 * self.period / noise.lasting_time))
-        return Colour(2 if self.kind == Kind.PLANE else 1, noise.lasting_time, inflation)
+        return Colour(_STATES[self.kind], noise.lasting_time, inflation)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +121,7 @@ def given_noise(sensor: SensorConfig | None, source: Source) -> dict[str, float]
     """Return the fields of Noise that a configuration gives.
 
     Where it gives a `correlation_time` and no `sigma_lasting`, the errors last whose deviation it gives, of azimuth or
-    position; of each report's own are left the steps of the source's numbers.
+    position, but for a fifth of that deviation, which is each report's own.
     """
     if sensor is None:
         return {}
@@ -137,9 +149,11 @@ def _lasting(sensor: SensorConfig, source: Source) -> dict[str, float]:
         return {"lasting": float(np.radians(sensor.sigma_lasting)) if turns else sensor.sigma_lasting}
     if sensor.correlation_time is None:
         return {}
+    rest = float(np.sqrt(1.0 - _OWN**2))
     if turns and sensor.sigma_azimuth is not None:
-        least = max(source.azimuth_lsb / np.sqrt(12.0), LEAST_ANGLE)
-        return {"lasting": float(np.radians(sensor.sigma_azimuth)), "azimuth": least}
+        sigma = float(np.radians(sensor.sigma_azimuth))
+        return {"lasting": rest * sigma, "azimuth": max(_OWN * sigma, source.azimuth_lsb / np.sqrt(12.0))}
     if sensor.sigma_xy is not None:
-        return {"lasting": sensor.sigma_xy, "xy": max(source.xy_lsb / np.sqrt(12.0), LEAST)}
+        own = max(_OWN * sensor.sigma_xy, source.xy_lsb / np.sqrt(12.0))
+        return {"lasting": rest * sensor.sigma_xy, "xy": own}
     return {}

@@ -86,7 +86,7 @@ class FusedStates:
             config.filter,
             config.tracker,
             config.systems,
-            [sensor.wait for sensor in setup.sensors],
+            [s.of_tracker() for s in setup.sensors],
             use_identity=setup.use_identity,
         )
         self.track, self.span = np.zeros(len(told.track), np.int32), (np.inf, -np.inf)

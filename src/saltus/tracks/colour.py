@@ -161,6 +161,10 @@ class Colours:
         """Return a (k,) of the lasting errors of sources over intervals dt (k,), s."""
         return np.exp(-dt / self._time[sources]) if len(self._time) else np.zeros(len(dt))
 
+    def rate(self, sources: _Sources) -> _Array:
+        """Return 1 / tau of the lasting errors of sources, 1/s."""
+        return 1.0 / self._time[sources] if len(self._time) else np.zeros(len(sources))
+
     def _reserve(self, size: int) -> None:
         more = max(size, 2 * len(self.owner)) - len(self.owner)
         if size > len(self.owner):

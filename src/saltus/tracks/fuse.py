@@ -15,6 +15,8 @@ from saltus.tracks.publish import Told, coast, updated_rows
 from saltus.tracks.rows import Rows
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 from saltus.tracks.sights import sighted
+from saltus.tracks.sources import SourceSetup
+from saltus.tracks.starts import erring
 from saltus.tracks.step import absorb, judge
 
 __all__ = ["Candidates", "Fusion"]
@@ -56,7 +58,7 @@ class Fusion:
         settings: TrackerSettings,
         filters: FilterSettings,
         laws: Sequence[PlotLaw],
-        periods: Sequence[float],
+        sources: Sequence[SourceSetup],
         *,
         use_identity: bool,
     ) -> None:
@@ -66,11 +68,12 @@ class Fusion:
             settings: faults, coasting, gates of heights.
             filters: manoeuvres.
             laws: what may be wrong with reports of each source.
-            periods: s without a report after which a target counts as missed, of each source.
+            sources: all of them.
             use_identity: whether tracks take over addresses and codes.
         """
-        self._kinematics, self._life = make_kinematics(filters), Lifecycle(settings)
-        self._periods, self._use_identity = np.asarray(periods, float), use_identity
+        self._kinematics = make_kinematics(filters, [s.colour for s in sources], settings)
+        self._life = Lifecycle(settings)
+        self._periods, self._use_identity = np.array([s.wait for s in sources]), use_identity
         self._gate = Gate(settings, filters, self._periods, use_identity=use_identity)
         self.conditions = [SourceCondition(law, settings) for law in laws]
         self._row: dict[int, int] = {}  # of each system track alive
@@ -120,7 +123,8 @@ class Fusion:
         if not len(new.track):
             return []
         life, n = self._life, len(new.track)
-        rows = self._kinematics.add(Start(new.mean, new.cov))
+        L, time, source = m.lasting[new.number], m.time[new.number], m.source[new.number]
+        rows = self._kinematics.add(erring(Start(new.mean, new.cov), self._kinematics.colours, source, time, L))
         self._row |= dict(zip(new.track.tolist(), rows.tolist(), strict=True))
         periods = self._periods[m.source[new.number]]
         life.begin(rows, Birth(m.time[new.number], periods, new.number, new.mean, new.cov))

@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.records import Source
+from saltus.tracks.lasting import Lasting
 from saltus.tracks.measurements import Measurements, Noise
 
-__all__ = ["LEAST", "LEAST_ANGLE", "NoiseEstimate", "apply_estimate", "estimate_noise", "widened"]
+__all__ = ["LEAST", "LEAST_ANGLE", "NoiseEstimate", "apply_estimate", "estimate_noise", "widened", "with_lasting"]
 
 _Array = npt.NDArray[np.float64]
 
@@ -39,6 +40,10 @@ class NoiseEstimate(NamedTuple):
     n_windows: int
     elevation: float = float("nan")  # rad
     range_rate: float = float("nan")  # m/s
+    lasting: float = float("nan")  # rad or m, of errors that last; 0: none does
+    lasting_time: float = float("nan")  # s
+    lasting_told: bool = False  # whether the recording tells that time, or it is assumed
+    lasting_gain: float = float("nan")  # nats per report that they explain more than white errors
 
 
 def estimate_noise(m: Measurements, track_id: npt.NDArray[np.int64], source: int) -> NoiseEstimate:
@@ -173,12 +178,32 @@ def apply_estimate(noise: Noise, estimate: NoiseEstimate, source: Source) -> Noi
     )
 
 
+def with_lasting(
+    estimate: NoiseEstimate, noise: Noise, found: Lasting, source: Source, *, polar: bool
+) -> tuple[NoiseEstimate, Noise]:
+    """Put what was found of lasting errors into an estimate, and where there are any, into the noise.
+
+    Then the rest of the noise is what they leave to each report by itself.
+    """
+    if np.isnan(found.white):
+        return estimate, noise
+    estimate = estimate._replace(
+        lasting=found.lasting, lasting_time=found.time, lasting_told=found.told, lasting_gain=found.gain
+    )
+    if not found.lasting:
+        return estimate, noise
+    lasts = replace(noise, lasting=found.lasting, lasting_time=found.time)
+    if polar:
+        return estimate, replace(lasts, azimuth=max(found.white, source.azimuth_lsb / np.sqrt(12.0), LEAST_ANGLE))
+    return estimate, replace(lasts, xy=max(found.white, source.xy_lsb / np.sqrt(12.0), LEAST))
+
+
 def widened(noise: Noise, d2: _Array) -> Noise:
     """Widen the noise of a source whose innovations are larger than it explains.
 
     Errors that persist from plot to plot (multilateration, satellite navigation) hardly show in the scatter about a
     short curve, but they do in the innovations: where the 0.8 quantile of d2 = nu' S^-1 nu exceeds that of its law,
-    every standard deviation grows by the root of the ratio.
+    every standard deviation of a report by itself grows by the root of the ratio.
 
     Args:
         noise: what the tracks were made with.

@@ -47,6 +47,11 @@ class FilterSettings:
     sojourn_v: tuple[float, ...] = (90.0, 15.0)
     accel_time: float = 4.0
 
+    @property
+    def steady_density(self) -> float:
+        """Density of the horizontal acceleration in steady motion, m^2/s^3; one from plot to plot lasts a second."""
+        return self.accel_h[0] ** 2 * (self.accel_time or 1.0)
+
     def __post_init__(self) -> None:
         """Refuse settings that describe no filter."""
         if self.form not in ("decomposed", "joint"):

@@ -8,11 +8,12 @@ from saltus.tracks.kinematics import MOTION, Start, two_point_start, with_speed_
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
-__all__ = ["Starts"]
+__all__ = ["Starts", "erring"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
+_HELD = 0.99  # of the variance of a lasting error that a state may tell: the rest keeps the covariance definite
 _CLIMB = 15.0  # m/s: standard deviation of the vertical speed of a new track
 
 
@@ -86,3 +87,28 @@ class Starts:
         start.cov[flat, 4, 4] = np.where(latest, R1[flat, 2, 2], R0[flat, 2, 2])
         start.cov[flat, 5, 5] = _CLIMB**2
         return start
+
+
+def erring(start: Start, colours: Colours, source: npt.NDArray[np.int32], time: _Array, effect: _Array) -> Start:
+    """Give states that a source's reports alone have told of, lasting errors included, a state for these.
+
+    The track follows p + L u, so that to the extent to which its position is not known better than its reports,
+    cov(x, u) = -L and, over times short against tau, cov(v, u) = -L / tau. Both are scaled down by one factor where the
+    covariance of the motion does not hold so much.
+
+    Args:
+        start: states of motion.
+        colours: a table without rows, of all sources.
+        source: of the report that each state was updated by last, (k,).
+        time: of it, s.
+        effect: L of it, (k, 2, 2).
+    """
+    colours, k = colours.empty(len(source)), len(source)
+    L = colours.claim_each(source, time, effect)
+    cross = np.zeros((k, MOTION, colours.slots))
+    if L.any():
+        cross[:, :3:2], cross[:, 1:4:2] = -L, -L * colours.rate(source)[:, None, None]
+        held = cross.swapaxes(1, 2) @ np.linalg.solve(start.cov, cross)
+        share = np.linalg.eigvalsh(held)[:, -1]
+        cross *= np.sqrt(np.minimum(1.0, _HELD / np.maximum(share, 1e-12)))[:, None, None]
+    return start.beside(colours, cross)

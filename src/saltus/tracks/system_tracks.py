@@ -16,6 +16,7 @@ from saltus.tracks.membership import Segments
 from saltus.tracks.rows import Rows, join_rows
 from saltus.tracks.settings import FilterSettings, SystemsSettings, TrackerSettings
 from saltus.tracks.slices import slices
+from saltus.tracks.sources import SourceSetup
 from saltus.tracks.splits import second_echoes
 from saltus.tracks.systems import Registered, lasting_differences
 from saltus.tracks.window import Reported
@@ -92,7 +93,7 @@ class SystemTracking:
         filters: FilterSettings,
         settings: TrackerSettings,
         systems: SystemsSettings,
-        periods: Sequence[float],
+        sources: Sequence[SourceSetup],
         *,
         use_identity: bool,
     ) -> None:
@@ -106,13 +107,13 @@ class SystemTracking:
             filters: manoeuvres.
             settings: faults, coasting.
             systems: when the frame of a track moves.
-            periods: s without a report after which a target counts as missed, of each source.
+            sources: all of them, of all systems.
             use_identity: whether tracks take over addresses and codes.
         """
         self._ids, self._registered, self._segments = ids, registered, segments
         self._first = np.cumsum([0, *(len(own) for own in ids)])
-        self._fusion = Fusion(settings, filters, laws, periods, use_identity=use_identity)
-        self._width = min([_LONGEST, *periods])
+        self._fusion = Fusion(settings, filters, laws, sources, use_identity=use_identity)
+        self._width = min([_LONGEST, *(s.wait for s in sources)])
         system = np.repeat(np.arange(len(ids)), [len(own) for own in ids])
         own = np.flatnonzero(segments.track < len(system))  # another centre's tracks, numbered last, have no reports
         self._echoes = second_echoes(Segments(*(column[own] for column in segments)), system)
