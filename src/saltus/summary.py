@@ -9,6 +9,8 @@ import numpy as np
 
 from saltus.engine import Result
 from saltus.engine.learn import sigmas
+from saltus.engine.setup import SensorSetup
+from saltus.records import Kind
 from saltus.text import say, shown
 from saltus.tracks.health import degraded_intervals, nis_interval
 from saltus.tracks.noise import LEAST
@@ -101,6 +103,7 @@ def _noise_table(result: Result) -> dict[str, object]:
                 "estimated": _rounded(getattr(sensor.estimate, field) * scale),
                 "used": _rounded(getattr(sensor.noise, field) * scale),
             }
+        row["lasting"] = _lasting(sensor)
         row["update_period_s"] = _rounded(sensor.period)
         row["nis_mean"] = _rounded(total / n if n else np.nan)
         row["nis_expected"] = 2.0
@@ -108,6 +111,23 @@ def _noise_table(result: Result) -> dict[str, object]:
         row["nis_updates"] = n
         table[sensor.name if sensor.name not in table else f"{sensor.name} ({sensor.source.system})"] = row
     return table
+
+
+def _lasting(sensor: SensorSetup) -> dict[str, object] | None:
+    """State what of a source's errors lasts, how long, and what told it; None where nothing does."""
+    noise, scale = sensor.noise, 180.0 / np.pi if sensor.kind != Kind.PLANE else 1.0
+    if not noise.lasting:
+        return None
+    configured = "lasting" in sensor.given
+    told = "configured" if configured else "told by its tracks" if sensor.estimate.lasting_told else "assumed"
+    return {
+        "sigma_lasting": _rounded(noise.lasting * scale),
+        "unit": "m" if scale == 1.0 else "degrees",
+        "correlation_time_s": _rounded(noise.lasting_time),
+        "correlation_time": "configured" if "lasting_time" in sensor.given else told if not configured else "assumed",
+        "lasting_scale_distance_m": _rounded(noise.lasting_distance),
+        "gain_nats_per_report": _rounded(sensor.estimate.lasting_gain),
+    }
 
 
 def _fault_table(result: Result) -> dict[str, object]:
@@ -222,6 +242,7 @@ def show_summary(summary: dict[str, Any], output: Path, report: bool, systems: S
             if label.startswith("sigma")
         )
         low, high = row["nis_interval"]
+        sigmas += _said_of_lasting(row["lasting"])
         say(f"noise of {name}: {sigmas}; NIS {row['nis_mean']} (fits within {low:.2f} to {high:.2f})")
     for name, row in summary["faults"].items():
         if row["judged_plots"]:
@@ -234,6 +255,16 @@ def show_summary(summary: dict[str, Any], output: Path, report: bool, systems: S
     say(f"decoding {seconds['decoding']} s, tracking {seconds['tracking']} s; written to {output}/")
     if report:
         say(f"open {output / 'report.html'}")
+
+
+def _said_of_lasting(lasting: dict[str, Any] | None) -> str:
+    """Say what of a source's errors lasts, and how long."""
+    if lasting is None:
+        return ""
+    said = f"; beside it errors of {lasting['sigma_lasting']} {lasting['unit']} last"
+    if lasting["lasting_scale_distance_m"] is not None:
+        said += f" (1.4 times as large at {lasting['lasting_scale_distance_m']:g} m from the sensor)"
+    return f"{said}, correlation time {lasting['correlation_time_s']} s ({lasting['correlation_time']})"
 
 
 def _said_of_faults(name: str, row: dict[str, Any]) -> str:

@@ -167,7 +167,10 @@ def _estimated(setup: Setup, estimates: Mapping[int, NoiseEstimate], m: Measurem
         noise = apply_estimate(sensor.noise, estimate, source)
         white = noise.azimuth if sensor.kind == Kind.POLAR else noise.xy
         if sensor.may_last:
-            found = estimate_lasting(straight_pieces(m, rows, s, sensor.period), white, q)
+            site = (
+                (0.0, 0.0) if sensor.site is None else setup.plane.forward(sensor.site.latitude, sensor.site.longitude)
+            )
+            found = estimate_lasting(straight_pieces(m, rows, s, sensor.period, site), white, q)
             estimate, noise = with_lasting(estimate, noise, found, source, polar=sensor.kind == Kind.POLAR)
         sensors[s] = replace(sensor, noise=replace(noise, **sensor.given), estimate=estimate)
     return replace(setup, sensors=tuple(sensors))

@@ -3,11 +3,11 @@
 Of one component of a report, the state s = (x, v, u) of a target that flies straight, but for accelerations of density
 q, and of an error that lasts,
 
-    z = x + g u + white,   var u = 1,   cov(u(t), u(t + s)) = exp(-|s| / tau),   g = c h,
+    z = x + g u + white,   var u = 1,   cov(u(t), u(t + s)) = exp(-|s| / tau),   g = c h sqrt(1 + (d / d_s)^2),
 
-with h = 1 of positions, the ground range of an azimuth. What such a source tells of itself is w, D = 2 c^2 / tau and q;
-tau only where it is short against sqrt(D / q), beyond which a target's own wandering looks the same. A prior on log tau
-fills what data leave open.
+with h = 1 of positions, the ground range of an azimuth, and d the distance from the sensor. What such a source tells of
+itself is w, D = 2 c^2 / tau and q; tau only where it is short against sqrt(D / q), beyond which a target's own
+wandering looks the same.
 """
 
 from collections.abc import Iterator, Mapping
@@ -33,9 +33,11 @@ _PIECES, _REPORTS = 30, 1000  # from which something can be told
 _MOST = 2500  # reports used
 _GAIN, _PER_REPORT = 10.0, 0.01  # nats that lasting errors must explain more
 _TIME, _SHORT = 60.0, 6.0  # s: the time assumed, and one at which errors that last for less show, too
+_SCALES = (1e4, 3e3, 1e3, 3e2)  # m: distances at which lasting errors may be 1.4 times as large as at the sensor
 _BETWEEN = (35.0, 20.0, 12.0, 3.5, 2.0)  # s: others that may be told
 _CONTRADICTED = 2.5  # nats
 _REACH = 9.0  # logarithms: how far estimates may lie from where the search begins
+_MOVING = 3.0  # m/s
 _STEP = 1e-4  # logarithm, of numeric derivatives
 _DIFFUSE = 1e5  # m and m/s: what is known of a target before its first report
 
@@ -46,6 +48,7 @@ class Lasting(NamedTuple):
     white: float = float("nan")  # standard deviation of each report by itself, m or rad; NaN: nothing tells
     lasting: float = 0.0  # of what lasts, m or rad; 0: nothing does
     time: float = _TIME  # s
+    distance: float = float("inf")  # m: where it is 1.4 times as large as at the sensor
     told: bool = False  # whether the data tell the time, or it is assumed
     gain: float = 0.0  # nats per report that lasting errors explain more than white ones
     reports: int = 0
@@ -57,6 +60,7 @@ class Pieces(NamedTuple):
     t: _Array  # (S, K), s
     z: _Array  # (S, K), m
     h: _Array  # (S, K): m per unit of the error
+    d: _Array  # (S, K): distance from the sensor, m; 0 where lasting errors do not grow with it
 
     @property
     def reports(self) -> int:
@@ -64,7 +68,7 @@ class Pieces(NamedTuple):
         return int(np.isfinite(self.z).sum())
 
 
-def straight_pieces(m: Measurements, rows: Rows, source: int, period: float) -> Pieces:
+def straight_pieces(m: Measurements, rows: Rows, source: int, period: float, site: _Array | None = None) -> Pieces:
     """Cut the tracks of a source where they manoeuvre or pause; of a radar what lies across the ray.
 
     Args:
@@ -72,6 +76,7 @@ def straight_pieces(m: Measurements, rows: Rows, source: int, period: float) -> 
         rows: of the tracker that took them; `measurement` is the number of the plot.
         source: which.
         period: its update period, s.
+        site: where the sensor stands in the plane, (2,), m; None: in its middle.
     """
     place = np.searchsorted(m.plot, np.maximum(rows.measurement, 0))
     place = np.minimum(place, max(len(m) - 1, 0))
@@ -84,8 +89,8 @@ def straight_pieces(m: Measurements, rows: Rows, source: int, period: float) -> 
     track, plot, time = track[keep], plot[keep], time[keep]
     cut = (np.diff(track) != 0) | (np.diff(time) > _MAX_GAP * max(period, _STEP_LEAST)) | (np.diff(time) <= 0.0)
     edges = np.concatenate([[0], 1 + np.flatnonzero(cut), [len(plot)]])
-    series = [part for begin, end in pairwise(edges.tolist()) for part in _parts(m, plot[begin:end])]
-    out = np.full((3, len(series), max((len(t) for t, _, _ in series), default=0)), np.nan)
+    series = [part for begin, end in pairwise(edges.tolist()) for part in _parts(m, plot[begin:end], site)]
+    out = np.full((4, len(series), max((len(part[0]) for part in series), default=0)), np.nan)
     for k, part in enumerate(series):
         out[:, k, : len(part[0])] = part
     return Pieces(*out)
@@ -106,23 +111,23 @@ def _near_manoeuvre(track: npt.NDArray[np.int64], time: _Array, p: _Array) -> np
     return np.asarray(np.minimum(np.abs(where[after] - key), np.abs(where[before] - key)) <= _MARGIN)
 
 
-def _parts(m: Measurements, plot: _Index) -> Iterator[tuple[_Array, _Array, _Array]]:
-    """Times, values and scales of the components of a piece, in parts not too long."""
+def _parts(m: Measurements, plot: _Index, site: _Array | None) -> Iterator[tuple[_Array, ...]]:
+    """Times, values, factors and distances of the components of a piece, in parts not too long."""
     for begin in range(0, len(plot) - _FEWEST + 1, _LONGEST):
         part = plot[begin : begin + _LONGEST]
-        if len(part) < _FEWEST:
-            continue
         t, xy, ray = m.time[part], m.position[part, :2], m.ray[part]
+        if len(part) < _FEWEST or np.hypot(*(xy[-1] - xy[0])) < _MOVING * (t[-1] - t[0]):
+            continue  # what stands still repeats one rounded position
         if np.isfinite(ray).all():
             rho = np.hypot(ray[:, 0], ray[:, 1])
             middle = ray[len(part) // 2] / rho[len(part) // 2]
-            yield t, xy @ np.array([-middle[1], middle[0]]), rho
+            yield t, xy @ np.array([-middle[1], middle[0]]), rho, np.zeros(len(part))
         else:
             for axis in range(2):
-                yield t, xy[:, axis], np.ones(len(part))
+                yield t, xy[:, axis], np.ones(len(part)), np.hypot(*(xy if site is None else xy - site).T)
 
 
-def estimate_lasting(pieces: Pieces, white: float, q: float, distance: _Array | None = None) -> Lasting:
+def estimate_lasting(pieces: Pieces, white: float, q: float) -> Lasting:
     """Estimate what lasts of a source's errors, if anything does.
 
     Lasting errors are accepted where they explain the pieces better by 10 nats and .01 a report than white ones under
@@ -133,7 +138,6 @@ def estimate_lasting(pieces: Pieces, white: float, q: float, distance: _Array | 
         pieces: of the source.
         white: what its errors are where none lasts, to start from.
         q: acceleration density of steady motion, m^2/s^3, to start from.
-        distance: of each report in the pieces from the sensor (S, K), m, if lasting errors may grow with it.
 
     Source: theory notes on lasting errors in the tracker, sections 3 and 5.
     """
@@ -143,20 +147,41 @@ def estimate_lasting(pieces: Pieces, white: float, q: float, distance: _Array | 
     pieces = Pieces(*(column[:: -(-n // _MOST)] for column in pieces))
     n = pieces.reports
     alone = _best(pieces, None, np.log([white, q]))
-    start = alone.at + np.log([0.5, 1.0])  # half of what varies from report to report, and as much in half a minute
-    tried = {_TIME: _best(pieces, _TIME, np.append(start, 2.0 * alone.at[0] - np.log(30.0)))}
-    tried[_SHORT] = _best(pieces, _SHORT, tried[_TIME].at)
+    pieces, distance, tried = _grown(pieces, alone)
     top = max(tried.values(), key=lambda fit: fit.value)
-    gain = (top.value - alone.value) / n
-    if gain * n < _GAIN or gain < _PER_REPORT:
-        return Lasting(float(np.exp(alone.at[0])), gain=gain, reports=n)
+    if top.value - alone.value < max(_GAIN, _PER_REPORT * n):
+        return Lasting(float(np.exp(alone.at[0])), gain=(top.value - alone.value) / n, reports=n)
     for tau in _BETWEEN:
         tried[tau] = _best(pieces, tau, top.at)
     top = max(tried.values(), key=lambda fit: fit.value)
     tau = _longest(tried, top.value - _CONTRADICTED)
     fit = tried[tau] if tau in tried else _best(pieces, tau, top.at)
     w, _, D = (float(v) for v in np.exp(fit.at))
-    return Lasting(w, float(np.sqrt(0.5 * D * tau)), tau, tau < _TIME, gain, n)
+    gain = (fit.value - alone.value) / n
+    return Lasting(w, float(np.sqrt(0.5 * D * tau)), tau, distance, tau < _TIME, gain, n)
+
+
+def _grown(pieces: Pieces, alone: "_Fit") -> tuple[Pieces, float, dict[float, "_Fit"]]:
+    """Fit lasting errors of two times, which grow with distance if that explains the pieces better; say by what scale.
+
+    Args:
+        pieces: with distances in m.
+        alone: the best that white errors do.
+
+    Returns:
+        Pieces with distances in units of the scale, the scale, and the fits by their times.
+    """
+    w, q = alone.at  # half of what varies from report to report, and as much of what lasts in half a minute
+    start = np.array([w + np.log(0.5), q, 2.0 * w - np.log(30.0)])
+    flat = pieces._replace(d=0.0 * pieces.d)
+    best, distance, fit = flat, float("inf"), _best(flat, _TIME, start)
+    for scale in _SCALES if np.nanmax(pieces.d) > 0.0 else ():
+        scaled = pieces._replace(d=pieces.d / scale)
+        less = np.log(float(np.nanmean(1.0 + scaled.d**2)))
+        other = _best(scaled, _TIME, fit.at - [0.0, 0.0, less])
+        if other.value > fit.value + _GAIN:
+            best, distance, fit = scaled, scale, other
+    return best, distance, {_TIME: fit, _SHORT: _best(best, _SHORT, fit.at)}
 
 
 class _Fit(NamedTuple):
@@ -176,7 +201,7 @@ def _best(pieces: Pieces, tau: float | None, start: _Array) -> _Fit:
         return float(value[0]), (value[1:] - value[0]) / _STEP
 
     bounds = [(v - _REACH, v + _REACH) for v in start]
-    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 40, "ftol": 1e-7})
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25, "ftol": 2e-6})
     return _Fit(-float(found.fun), np.asarray(found.x))
 
 
@@ -185,6 +210,7 @@ class _Likelihood:
 
     def __init__(self, pieces: Pieces, tau: float) -> None:
         self._tau, self._h = tau, np.where(np.isfinite(pieces.h), pieces.h, 1.0)
+        self._g = self._h * np.sqrt(1.0 + np.nan_to_num(pieces.d) ** 2)
         self._z = (pieces.z - pieces.z[:, :1])[..., None]
         dt = np.nan_to_num(np.diff(pieces.t, axis=1, prepend=pieces.t[:, :1]))
         a = np.exp(-dt / tau)
@@ -201,7 +227,7 @@ class _Likelihood:
         w, q = candidates[:, 0], candidates[:, 1]
         D = candidates[:, 2] if candidates.shape[1] == 3 else np.zeros(P)
         H = np.zeros((P, *self._h.shape, 1, 3))
-        H[..., 0, 0], H[..., 0, 2] = 1.0, np.sqrt(0.5 * D * self._tau)[each] * self._h
+        H[..., 0, 0], H[..., 0, 2] = 1.0, np.sqrt(0.5 * D * self._tau)[each] * self._g
         found = imm_filter(
             np.broadcast_to(self._z, (P, *self._z.shape)),
             F=np.broadcast_to(self._F, (P, *self._F.shape)),

@@ -15,7 +15,7 @@ from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.rows import Assignments, Rows
 
-__all__ = ["LocalSystem", "Misfit", "Party", "foreign_systems", "group_sources", "local_system", "Stated"]
+__all__ = ["LocalSystem", "Misfit", "Party", "Stated", "foreign_systems", "group_sources", "local_system"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.int64]

@@ -42,6 +42,7 @@ class NoiseEstimate(NamedTuple):
     range_rate: float = float("nan")  # m/s
     lasting: float = float("nan")  # rad or m, of errors that last; 0: none does
     lasting_time: float = float("nan")  # s
+    lasting_distance: float = float("inf")  # m at which they are 1.4 times as large as at the sensor
     lasting_told: bool = False  # whether the recording tells that time, or it is assumed
     lasting_gain: float = float("nan")  # nats per report that they explain more than white errors
 
@@ -188,11 +189,15 @@ def with_lasting(
     if np.isnan(found.white):
         return estimate, noise
     estimate = estimate._replace(
-        lasting=found.lasting, lasting_time=found.time, lasting_told=found.told, lasting_gain=found.gain
+        lasting=found.lasting,
+        lasting_time=found.time,
+        lasting_distance=found.distance,
+        lasting_told=found.told,
+        lasting_gain=found.gain,
     )
     if not found.lasting:
         return estimate, noise
-    lasts = replace(noise, lasting=found.lasting, lasting_time=found.time)
+    lasts = replace(noise, lasting=found.lasting, lasting_time=found.time, lasting_distance=found.distance)
     if polar:
         return estimate, replace(lasts, azimuth=max(found.white, source.azimuth_lsb / np.sqrt(12.0), LEAST_ANGLE))
     return estimate, replace(lasts, xy=max(found.white, source.xy_lsb / np.sqrt(12.0), LEAST))
