@@ -167,10 +167,10 @@ def _estimated(setup: Setup, estimates: Mapping[int, NoiseEstimate], m: Measurem
         noise = apply_estimate(sensor.noise, estimate, source)
         white = noise.azimuth if sensor.kind == Kind.POLAR else noise.xy
         if sensor.may_last:
-            site = (
-                (0.0, 0.0) if sensor.site is None else setup.plane.forward(sensor.site.latitude, sensor.site.longitude)
-            )
-            found = estimate_lasting(straight_pieces(m, rows, s, sensor.period, site), white, q)
+            stands = None
+            if sensor.site is not None:
+                stands = np.asarray(setup.plane.forward(sensor.site.latitude, sensor.site.longitude), np.float64)
+            found = estimate_lasting(straight_pieces(m, rows, s, sensor.period, stands), white, q)
             estimate, noise = with_lasting(estimate, noise, found, source, polar=sensor.kind == Kind.POLAR)
         sensors[s] = replace(sensor, noise=replace(noise, **sensor.given), estimate=estimate)
     return replace(setup, sensors=tuple(sensors))
