@@ -32,6 +32,7 @@ system = "platform"               # optional: sources of one system make common 
 [intake]                          # fields of saltus.tracks.setup_settings.IntakeSettings
 [setup]                           # fields of saltus.tracks.setup_settings.SetupSettings
 [periods]                         # fields of saltus.tracks.setup_settings.PeriodSettings
+[lasting]                         # fields of saltus.tracks.setup_settings.LastingSettings
 [tracker]                         # fields of saltus.tracks.settings.TrackerSettings
 [filter]                          # fields of saltus.tracks.settings.FilterSettings
 [systems]                         # fields of saltus.tracks.settings.SystemsSettings
@@ -58,7 +59,7 @@ from saltus.records import Recording, System
 from saltus.text import brief, cut, shown
 from saltus.toml import load_toml
 from saltus.tracks.settings import FilterSettings, RegistrationSettings, SystemsSettings, TrackerSettings
-from saltus.tracks.setup_settings import IntakeSettings, PeriodSettings, SetupSettings
+from saltus.tracks.setup_settings import IntakeSettings, LastingSettings, PeriodSettings, SetupSettings
 
 if TYPE_CHECKING:
     from saltus.io.in_order import InOrder
@@ -96,6 +97,7 @@ _TABLES: dict[str, type[Any]] = {
     "intake": IntakeSettings,
     "setup": SetupSettings,
     "periods": PeriodSettings,
+    "lasting": LastingSettings,
     "tracker": TrackerSettings,
     "filter": FilterSettings,
     "systems": SystemsSettings,
@@ -177,6 +179,7 @@ class Config(BaseModel):
     intake: IntakeSettings = Field(default_factory=IntakeSettings)
     setup: SetupSettings = Field(default_factory=SetupSettings)
     periods: PeriodSettings = Field(default_factory=PeriodSettings)
+    lasting: LastingSettings = Field(default_factory=LastingSettings)
     tracker: TrackerSettings = Field(default_factory=TrackerSettings)
     filter: FilterSettings = Field(default_factory=FilterSettings)
     systems: SystemsSettings = Field(default_factory=SystemsSettings)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from saltus.errors import ModelError
-from saltus.tracks.kinematics import Kinematics, Start, make_kinematics
+from saltus.tracks.channel import Start
+from saltus.tracks.kinematics import Kinematics, make_kinematics
 from saltus.tracks.settings import FilterSettings
 
 ACCEL = {"accel_h": (0.3,), "sojourn_h": (50.0,), "accel_v": (0.1,), "sojourn_v": (50.0,)}

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from tracking_scenes import measured
 
+from saltus.tracks.channel import Start
 from saltus.tracks.colour import NO_SOURCE, Colour, Colours
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate
-from saltus.tracks.kinematics import Chosen, Start, make_kinematics
+from saltus.tracks.kinematics import Chosen, make_kinematics
 from saltus.tracks.lifecycle import Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings

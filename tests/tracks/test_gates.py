@@ -8,9 +8,10 @@ from scipy.stats import chi2, ncx2
 from tracking_scenes import measured
 
 from saltus.records import Kind
+from saltus.tracks.channel import Start
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, distances, predict
-from saltus.tracks.kinematics import Start, make_kinematics
+from saltus.tracks.kinematics import make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 

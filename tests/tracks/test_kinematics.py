@@ -6,8 +6,10 @@ from scipy.linalg import block_diag, expm
 
 from saltus.errors import ModelError
 from saltus.filters import imm_filter
-from saltus.tracks.kinematics import Chosen, Plan, Start, make_kinematics, two_point_start, with_speed_prior
+from saltus.tracks.channel import Plan, Start
+from saltus.tracks.kinematics import Chosen, make_kinematics
 from saltus.tracks.settings import FilterSettings
+from saltus.tracks.starts import two_point_start, with_speed_prior
 
 STEPS = np.array([4.0, 3.7, 4.4, 8.1, 0.2, 4.0])
 SETTINGS = dict(accel_h=(0.5, 6.0), sojourn_h=(80.0, 20.0), accel_v=(0.2, 3.0, 9.0), sojourn_v=(60.0, 15.0, 5.0))

@@ -124,20 +124,28 @@ def test_errors_that_last_average_to_what_evidence_believes(tau):
 def test_a_configured_correlation_time_is_that_of_the_deviation_given():
     radar = Source(System(48, 1, 2), CATEGORIES[48].traits, azimuth_lsb=1e-4)
     ship = Source(System(None, None, None, "ship"))
-    given = given_noise(SensorConfig(name="ship", sigma_xy=2.0, correlation_time=5.0), ship)
+    given = given_noise(SensorConfig(name="ship", sigma_xy=2.0, correlation_time=5.0), ship, Kind.PLANE, 0.2)
     assert np.hypot(given["lasting"], given["xy"]) == pytest.approx(2.0)
     assert (given["xy"], given["lasting_time"]) == (pytest.approx(0.4), 5.0)
-    given = given_noise(SensorConfig(sac=1, sic=2, sigma_azimuth=0.1, sigma_range=9.0, correlation_time=5.0), radar)
+    given = given_noise(
+        SensorConfig(sac=1, sic=2, sigma_azimuth=0.1, sigma_range=9.0, correlation_time=5.0), radar, Kind.POLAR, 0.2
+    )
     assert np.hypot(given["lasting"], given["azimuth"]) == pytest.approx(np.radians(0.1))
     assert (given["azimuth"], given["range"]) == (pytest.approx(np.radians(0.02)), 9.0)
-    given = given_noise(SensorConfig(name="ship", sigma_xy=2.0, sigma_lasting=7.0, lasting_scale_distance=9e3), ship)
+    given = given_noise(
+        SensorConfig(name="ship", sigma_xy=2.0, sigma_lasting=7.0, lasting_scale_distance=9e3), ship, Kind.PLANE, 0.2
+    )
     assert (given["lasting"], given["xy"], given["lasting_distance"]) == (7.0, 2.0, 9e3)
-    assert "lasting" not in given_noise(SensorConfig(name="ship", sigma_xy=2.0), ship)
+    alone = SensorConfig(name="ship", sigma_lasting=7.0)
+    assert given_noise(alone, ship, Kind.PLANE, 0.2) == {"lasting": 7.0}  # m, whatever else is told
+    assert given_noise(alone, ship, Kind.BEARING, 0.2) == {"lasting": np.radians(7.0)}
+    assert "lasting" not in given_noise(SensorConfig(name="ship", sigma_xy=2.0), ship, Kind.PLANE, 0.2)
 
 
 @pytest.mark.parametrize(("told", "time"), [({"sigma_time": 0.05}, 0.05), ({"sigma_xy": 3.0}, 0.0), ({}, None)])
 def test_a_position_whose_noise_is_configured_has_exact_times_unless_told(told, time):
-    assert given_noise(SensorConfig(name="ship", **told), Source(System(None, None, None, "ship"))).get("time") == time
+    ship = Source(System(None, None, None, "ship"))
+    assert given_noise(SensorConfig(name="ship", **told), ship, Kind.PLANE, 0.2).get("time") == time
 
 
 @pytest.mark.parametrize(("category", "time"), [(21, 0.2 / np.sqrt(12.0)), (10, 0.0)])

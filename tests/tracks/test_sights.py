@@ -8,10 +8,11 @@ from tracking_scenes import fed, tracker_of
 
 from saltus.geo import Plane
 from saltus.records import Kind, Plots, Source, System
+from saltus.tracks.channel import Start
 from saltus.tracks.colour import Colour
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate
-from saltus.tracks.kinematics import Chosen, Start, make_kinematics
+from saltus.tracks.kinematics import Chosen, make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Birth, Lifecycle
 from saltus.tracks.measurements import Noise, place_plots
 from saltus.tracks.settings import FilterSettings, TrackerSettings

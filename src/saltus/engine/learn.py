@@ -91,7 +91,8 @@ def _sensor(
     own, at = plots.take(plots.source == s), np.flatnonzero(m.source == s)
     period = sensor.period if sensor is not None and sensor.period else _period(source, own, m, at, config, told)
     used = NO_PERIOD if np.isnan(period) else period
-    given = given_noise(sensor, source)
+    kind = _kind(source, own.kind)
+    given = given_noise(sensor, source, kind, config.lasting.own_share)
     density = config.tracker.clutter_density
     return SensorSetup(
         source=source,
@@ -102,7 +103,7 @@ def _sensor(
         told_period=period,
         period=used,
         wait=max(used, source.traits.rest_period),
-        kind=_kind(source, own.kind),
+        kind=kind,
         elevations=bool(np.isfinite(own.elevation[own.kind == Kind.POLAR]).any()),
         range_rates=bool(np.isfinite(own.range_rate[own.kind == Kind.POLAR]).any()),
         heard=len(own) > 0,
@@ -161,7 +162,7 @@ def _with_noise(setup: Setup, plots: Plots, own: Sequence[int], bar: Progress) -
 
 def _estimated(setup: Setup, estimates: Mapping[int, NoiseEstimate], m: Measurements, rows: Rows) -> Setup:
     """Give sources the noise estimated, and what lasts of it, where nothing is configured."""
-    sensors, q = list(setup.sensors), setup.config.filter.steady_density
+    sensors, settings = list(setup.sensors), setup.config.lasting
     for s, estimate in estimates.items():
         sensor, source = sensors[s], sensors[s].source
         noise = apply_estimate(sensor.noise, estimate, source)
@@ -170,7 +171,9 @@ def _estimated(setup: Setup, estimates: Mapping[int, NoiseEstimate], m: Measurem
             stands = None
             if sensor.site is not None:
                 stands = np.asarray(setup.plane.forward(sensor.site.latitude, sensor.site.longitude), np.float64)
-            found = estimate_lasting(straight_pieces(m, rows, s, sensor.period, stands), white, q)
+            pieces = straight_pieces(m, rows, s, sensor.period, settings, stands)
+            told = sensor.given.get("lasting_time")
+            found = estimate_lasting(pieces, white, setup.config.filter.steady_density, settings, told)
             estimate, noise = with_lasting(estimate, noise, found, source, polar=sensor.kind == Kind.POLAR)
         sensors[s] = replace(sensor, noise=replace(noise, **sensor.given), estimate=estimate)
     return replace(setup, sensors=tuple(sensors))

@@ -166,7 +166,7 @@ def _sensor(learnt: _Sensor, config: Config) -> SensorSetup:
     set_period = None if sensor is None else sensor.period
     told = set_period or learnt.told_period
     period = set_period or learnt.period
-    given = given_noise(sensor, source)
+    given = given_noise(sensor, source, _KINDS[learnt.kind], config.lasting.own_share)
     return SensorSetup(
         source=source,
         name=sensor.name if sensor is not None and sensor.name else str(source.system),

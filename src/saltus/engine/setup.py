@@ -10,7 +10,7 @@ from saltus.config import Config, SensorConfig
 from saltus.geo import Plane, Site
 from saltus.records import Kind, Plots, Source
 from saltus.tracks.background import Background
-from saltus.tracks.colour import Colour
+from saltus.tracks.colour import Colour, inflation
 from saltus.tracks.local import Party, group_sources
 from saltus.tracks.measurements import Measurements, Noise, place_plots
 from saltus.tracks.noise import NoiseEstimate
@@ -20,7 +20,6 @@ from saltus.tracks.sources import SourceSetup, TrackerSetup
 __all__ = ["SensorSetup", "Setup", "given_noise", "site_of"]
 
 _STATES = {Kind.PLANE: 2, Kind.POLAR: 1, Kind.BEARING: 0}  # for lasting errors; one angle alone tells none of its own
-_OWN = 0.2  # of a deviation that is said to last: reports told as free of errors of their own would outweigh all others
 _UNKNOWN_HEIGHT = (300.0, 300.0)  # m: mean and standard deviation of a site's height where none is given
 
 
@@ -53,25 +52,19 @@ class SensorSetup:
     def may_last(self) -> bool:
         """Whether lasting errors are looked for.
 
-        They are where one instrument gives azimuths or positions and nothing is configured of them. Where targets tell
-        their positions themselves each errs by its own means, and a source tells nothing of another target's.
+        They are where one instrument gives azimuths or positions and no deviation of these is configured. Where targets
+        tell their positions themselves each errs by its own means, and a source tells nothing of another target's.
         """
-        given = {"lasting", "lasting_time", "azimuth" if self.kind == Kind.POLAR else "xy"}
+        given = {"lasting", "azimuth" if self.kind == Kind.POLAR else "xy"}
         return self.kind != Kind.BEARING and not self.source.traits.self_reporting and not given & set(self.given)
 
     @property
     def colour(self) -> Colour:
-        """Its errors that last.
-
-        Of errors with the correlation a^|k| between reports k periods apart, a = exp(-period / tau), the mean of many
-        has (1 + a)/(1 - a) times the variance of as many independent ones: their inflation where they are taken for
-        such.
-        """
+        """Its errors that last."""
         noise = self.noise
         if not noise.lasting:
             return Colour()
-        inflation = float(1.0 / np.tanh(0.5 * self.period / noise.lasting_time))
-        return Colour(_STATES[self.kind], noise.lasting_time, inflation)
+        return Colour(_STATES[self.kind], noise.lasting_time, float(inflation(self.period, noise.lasting_time)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,11 +110,17 @@ def site_of(sensor: SensorConfig | None) -> Site | None:
     return Site(float(latitude), float(longitude), height, sigma)
 
 
-def given_noise(sensor: SensorConfig | None, source: Source) -> dict[str, float]:
+def given_noise(sensor: SensorConfig | None, source: Source, kind: int, own_share: float) -> dict[str, float]:
     """Return the fields of Noise that a configuration gives.
 
     Where it gives a `correlation_time` and no `sigma_lasting`, the errors last whose deviation it gives, of azimuth or
-    position, but for a fifth of that deviation, which is each report's own.
+    position, but for a share of that deviation, which is each report's own.
+
+    Args:
+        sensor: as configured.
+        source: its reports.
+        kind: what it reports.
+        own_share: see `LastingSettings`.
     """
     if sensor is None:
         return {}
@@ -139,21 +138,12 @@ def given_noise(sensor: SensorConfig | None, source: Source) -> dict[str, float]
         "lasting_time": sensor.correlation_time,
         "lasting_distance": sensor.lasting_scale_distance,
     }
-    return {field: value for field, value in given.items() if value is not None} | _lasting(sensor, source)
-
-
-def _lasting(sensor: SensorConfig, source: Source) -> dict[str, float]:
-    """Return the deviation of errors that last, and what it leaves to each report by itself."""
-    turns = source.traits.rotating or sensor.sigma_xy is None
+    white, sigma, lsb = ("xy", sensor.sigma_xy, source.xy_lsb)
+    if kind != Kind.PLANE:
+        white, sigma, lsb = "azimuth", azimuth, source.azimuth_lsb
     if sensor.sigma_lasting is not None:
-        return {"lasting": float(np.radians(sensor.sigma_lasting)) if turns else sensor.sigma_lasting}
-    if sensor.correlation_time is None:
-        return {}
-    rest = float(np.sqrt(1.0 - _OWN**2))
-    if turns and sensor.sigma_azimuth is not None:
-        sigma = float(np.radians(sensor.sigma_azimuth))
-        return {"lasting": rest * sigma, "azimuth": max(_OWN * sigma, source.azimuth_lsb / np.sqrt(12.0))}
-    if sensor.sigma_xy is not None:
-        own = max(_OWN * sensor.sigma_xy, source.xy_lsb / np.sqrt(12.0))
-        return {"lasting": rest * sensor.sigma_xy, "xy": own}
-    return {}
+        given["lasting"] = sensor.sigma_lasting if kind == Kind.PLANE else float(np.radians(sensor.sigma_lasting))
+    elif sensor.correlation_time is not None and sigma is not None:
+        given["lasting"] = float(np.sqrt(1.0 - own_share**2)) * sigma
+        given[white] = max(own_share * sigma, lsb / float(np.sqrt(12.0)))
+    return {field: value for field, value in given.items() if value is not None}

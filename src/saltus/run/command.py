@@ -126,7 +126,7 @@ def write_tracks(
         "identity": given.identity,
         **{
             name: asdict(getattr(config, name))
-            for name in ("intake", "setup", "periods", "tracker", "filter", "systems", "registration")
+            for name in ("intake", "setup", "periods", "lasting", "tracker", "filter", "systems", "registration")
         },
     }
     summary["seconds"] = {

@@ -16,13 +16,26 @@ import numpy.typing as npt
 
 from saltus.tracks.settings import TrackerSettings
 
-__all__ = ["NO_SOURCE", "Colour", "Colours"]
+__all__ = ["NO_SOURCE", "Colour", "Colours", "inflation"]
 
 NO_SOURCE = -1
 
 _Array = npt.NDArray[np.float64]
 _Rows = npt.NDArray[np.intp]
 _Sources = npt.NDArray[np.int32]
+
+
+def inflation(dt: npt.ArrayLike, tau: npt.ArrayLike) -> _Array:
+    """Return how often the variance of lasting errors counts where each report's is taken for independent of others'.
+
+    Of errors with the correlation a^|k| between reports k intervals dt apart, a = exp(-dt / tau), the mean of many has
+    (1 + a) / (1 - a) = coth(dt / 2 tau) times the variance of as many independent ones.
+
+    Args:
+        dt: intervals, s; inf: a report by itself.
+        tau: correlation times, s.
+    """
+    return np.asarray(1.0 / np.tanh(0.5 * np.asarray(dt) / np.asarray(tau)))
 
 
 class Colour(NamedTuple):

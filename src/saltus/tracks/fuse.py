@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from saltus.tracks.channel import Start
 from saltus.tracks.faults import PlotLaw, SourceCondition
 from saltus.tracks.gates import Gate
-from saltus.tracks.kinematics import Start, make_kinematics
+from saltus.tracks.kinematics import make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, NO_CODE, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.publish import Told, coast, updated_rows

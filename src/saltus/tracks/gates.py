@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.tracks.associate import Pairs, equal_codes, join_pairs, near_pairs, nearest_pairs
+from saltus.tracks.channel import MOTION, Plan
 from saltus.tracks.colour import NO_SOURCE
 from saltus.tracks.faults import SourceCondition, rays
 from saltus.tracks.identity import conflicting
-from saltus.tracks.kinematics import MOTION, Kinematics, Plan
+from saltus.tracks.kinematics import Kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.range_rate import with_range_rates

@@ -20,24 +20,15 @@ import numpy.typing as npt
 from saltus.filters import imm_filter
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.rows import Rows
+from saltus.tracks.setup_settings import LastingSettings
 
 __all__ = ["Lasting", "Pieces", "estimate_lasting", "straight_pieces"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
 
-_STRAIGHT, _MARGIN = 0.3, 8.0  # probability of a manoeuvre, and s around one that are left out
-_FEWEST, _LONGEST = 20, 150  # reports of a piece
-_MAX_GAP = 2.5  # periods
-_PIECES, _REPORTS = 30, 1000  # from which something can be told
-_MOST = 2500  # reports used
-_GAIN, _PER_REPORT = 10.0, 0.01  # nats that lasting errors must explain more
-_TIME, _SHORT = 60.0, 6.0  # s: the time assumed, and one at which errors that last for less show, too
-_SCALES = (1e4, 3e3, 1e3, 3e2)  # m: distances at which lasting errors may be 1.4 times as large as at the sensor
-_BETWEEN = (35.0, 20.0, 12.0, 3.5, 2.0)  # s: others that may be told
-_CONTRADICTED = 2.5  # nats
+_SLOW = 1.0  # s: what ends a stretch is no shorter for sources that report more often
 _REACH = 9.0  # logarithms: how far estimates may lie from where the search begins
-_MOVING = 3.0  # m/s
 _STEP = 1e-4  # logarithm, of numeric derivatives
 _DIFFUSE = 1e5  # m and m/s: what is known of a target before its first report
 
@@ -47,7 +38,7 @@ class Lasting(NamedTuple):
 
     white: float = float("nan")  # standard deviation of each report by itself, m or rad; NaN: nothing tells
     lasting: float = 0.0  # of what lasts, m or rad; 0: nothing does
-    time: float = _TIME  # s
+    time: float = float("nan")  # s
     distance: float = float("inf")  # m: where it is 1.4 times as large as at the sensor
     told: bool = False  # whether the data tell the time, or it is assumed
     gain: float = 0.0  # nats per report that lasting errors explain more than white ones
@@ -68,7 +59,9 @@ class Pieces(NamedTuple):
         return int(np.isfinite(self.z).sum())
 
 
-def straight_pieces(m: Measurements, rows: Rows, source: int, period: float, site: _Array | None = None) -> Pieces:
+def straight_pieces(
+    m: Measurements, rows: Rows, source: int, period: float, settings: LastingSettings, site: _Array | None = None
+) -> Pieces:
     """Cut the tracks of a source where they manoeuvre or pause; of a radar what lies across the ray.
 
     Args:
@@ -76,6 +69,7 @@ def straight_pieces(m: Measurements, rows: Rows, source: int, period: float, sit
         rows: of the tracker that took them; `measurement` is the number of the plot.
         source: which.
         period: its update period, s.
+        settings: what is straight, and long enough.
         site: where the sensor stands in the plane, (2,), m; None: in its middle.
     """
     place = np.searchsorted(m.plot, np.maximum(rows.measurement, 0))
@@ -85,38 +79,41 @@ def straight_pieces(m: Measurements, rows: Rows, source: int, period: float, sit
     at = at[np.lexsort((rows.time[at], rows.track_id[at]))]
     track, plot = rows.track_id[at], place[at]
     time = m.time[plot]
-    keep = ~_near_manoeuvre(track, time, rows.moments.p_manoeuvre_h[at])
+    turning = rows.moments.p_manoeuvre_h[at] >= settings.straight
+    keep = ~_near(track, time, turning, settings.margin)
     track, plot, time = track[keep], plot[keep], time[keep]
-    cut = (np.diff(track) != 0) | (np.diff(time) > _MAX_GAP * max(period, _STEP_LEAST)) | (np.diff(time) <= 0.0)
+    step = np.diff(time)
+    cut = (np.diff(track) != 0) | (step > settings.gap * max(period, _SLOW)) | (step <= 0.0)
     edges = np.concatenate([[0], 1 + np.flatnonzero(cut), [len(plot)]])
-    series = [part for begin, end in pairwise(edges.tolist()) for part in _parts(m, plot[begin:end], site)]
+    ends = pairwise(edges.tolist())
+    series = [part for begin, end in ends for part in _parts(m, plot[begin:end], settings, site)]
     out = np.full((4, len(series), max((len(part[0]) for part in series), default=0)), np.nan)
     for k, part in enumerate(series):
         out[:, k, : len(part[0])] = part
     return Pieces(*out)
 
 
-_STEP_LEAST = 1.0  # s
-
-
-def _near_manoeuvre(track: npt.NDArray[np.int64], time: _Array, p: _Array) -> npt.NDArray[np.bool_]:
-    """Say which rows, sorted by track and time, lie within the margin of one that probably manoeuvres."""
-    turning = p >= _STRAIGHT
+def _near(
+    track: npt.NDArray[np.int64], time: _Array, turning: npt.NDArray[np.bool_], margin: float
+) -> npt.NDArray[np.bool_]:
+    """Say which rows, sorted by track and time, lie within the margin of one that turns."""
     if not turning.any():
         return turning
     key = np.searchsorted(np.unique(track), track) * 1e9 + (time - time.min())
     where = key[turning]
     after = np.minimum(np.searchsorted(where, key), len(where) - 1)
     before = np.maximum(after - 1, 0)
-    return np.asarray(np.minimum(np.abs(where[after] - key), np.abs(where[before] - key)) <= _MARGIN)
+    return np.asarray(np.minimum(np.abs(where[after] - key), np.abs(where[before] - key)) <= margin)
 
 
-def _parts(m: Measurements, plot: _Index, site: _Array | None) -> Iterator[tuple[_Array, ...]]:
+def _parts(
+    m: Measurements, plot: _Index, settings: LastingSettings, site: _Array | None
+) -> Iterator[tuple[_Array, ...]]:
     """Times, values, factors and distances of the components of a piece, in parts not too long."""
-    for begin in range(0, len(plot) - _FEWEST + 1, _LONGEST):
-        part = plot[begin : begin + _LONGEST]
+    for begin in range(0, len(plot) - settings.fewest + 1, settings.longest):
+        part = plot[begin : begin + settings.longest]
         t, xy, ray = m.time[part], m.position[part, :2], m.ray[part]
-        if len(part) < _FEWEST or np.hypot(*(xy[-1] - xy[0])) < _MOVING * (t[-1] - t[0]):
+        if len(part) < settings.fewest or np.hypot(*(xy[-1] - xy[0])) < settings.moving * (t[-1] - t[0]):
             continue  # what stands still repeats one rounded position
         if np.isfinite(ray).all():
             rho = np.hypot(ray[:, 0], ray[:, 1])
@@ -127,61 +124,72 @@ def _parts(m: Measurements, plot: _Index, site: _Array | None) -> Iterator[tuple
                 yield t, xy[:, axis], np.ones(len(part)), np.hypot(*(xy if site is None else xy - site).T)
 
 
-def estimate_lasting(pieces: Pieces, white: float, q: float) -> Lasting:
+def estimate_lasting(
+    pieces: Pieces, white: float, q: float, settings: LastingSettings, told: float | None = None
+) -> Lasting:
     """Estimate what lasts of a source's errors, if anything does.
 
-    Lasting errors are accepted where they explain the pieces better by 10 nats and .01 a report than white ones under
-    the best q. Their time is 60 s, or the longest that the pieces contradict by no more than 2.5 nats if that is less:
-    taken too short, errors are thought smaller than they are, and pieces that hold the edges of turns say too short.
+    Lasting errors are accepted where they explain the pieces better by so many nats, and so many a report, than white
+    ones under the best q. Their time is the one assumed, or the longest that the pieces do not contradict if that is
+    less: taken too short, errors are thought smaller than they are, and pieces that hold the edges of turns say too
+    short.
 
     Args:
         pieces: of the source.
         white: what its errors are where none lasts, to start from.
         q: acceleration density of steady motion, m^2/s^3, to start from.
+        settings: what is accepted, and which times and scales may be.
+        told: the time, where it is known, s.
 
     Source: theory notes on lasting errors in the tracker, sections 3 and 5.
     """
     n = pieces.reports
-    if len(pieces.t) < _PIECES and n < _REPORTS:
+    if len(pieces.t) < settings.stretches and n < settings.reports:
         return Lasting()
-    pieces = Pieces(*(column[:: -(-n // _MOST)] for column in pieces))
-    n = pieces.reports
+    pieces = Pieces(*(column[:: -(-n // settings.most)] for column in pieces))
+    n, assumed = pieces.reports, told or settings.time
     alone = _best(pieces, None, np.log([white, q]))
-    pieces, distance, tried = _grown(pieces, alone)
+    pieces, distance, fit = _grown(pieces, alone, assumed, settings)
+    tried = {assumed: fit}
+    if told is None and settings.times:  # one of half way shows errors that last for less, too
+        short = settings.times[len(settings.times) // 2]
+        tried[short] = _best(pieces, short, fit.at)
     top = max(tried.values(), key=lambda fit: fit.value)
-    if top.value - alone.value < max(_GAIN, _PER_REPORT * n):
+    if top.value - alone.value < max(settings.gain, settings.gain_per_report * n):
         return Lasting(float(np.exp(alone.at[0])), gain=(top.value - alone.value) / n, reports=n)
-    for tau in _BETWEEN:
-        tried[tau] = _best(pieces, tau, top.at)
+    for tau in settings.times if told is None else ():
+        tried[tau] = tried.get(tau) or _best(pieces, tau, top.at)
     top = max(tried.values(), key=lambda fit: fit.value)
-    tau = _longest(tried, top.value - _CONTRADICTED)
+    tau = _longest(tried, top.value - settings.contradicted)
     fit = tried[tau] if tau in tried else _best(pieces, tau, top.at)
     w, _, D = (float(v) for v in np.exp(fit.at))
     gain = (fit.value - alone.value) / n
-    return Lasting(w, float(np.sqrt(0.5 * D * tau)), tau, distance, tau < _TIME, gain, n)
+    return Lasting(w, float(np.sqrt(0.5 * D * tau)), tau, distance, tau < assumed, gain, n)
 
 
-def _grown(pieces: Pieces, alone: "_Fit") -> tuple[Pieces, float, dict[float, "_Fit"]]:
-    """Fit lasting errors of two times, which grow with distance if that explains the pieces better; say by what scale.
+def _grown(pieces: Pieces, alone: "_Fit", tau: float, settings: LastingSettings) -> tuple[Pieces, float, "_Fit"]:
+    """Fit lasting errors, which grow with distance if that explains the pieces better; say by what scale.
 
     Args:
         pieces: with distances in m.
         alone: the best that white errors do.
+        tau: the time that they last, s.
+        settings: scales that may be.
 
     Returns:
-        Pieces with distances in units of the scale, the scale, and the fits by their times.
+        Pieces with distances in units of the scale, the scale, and the fit.
     """
     w, q = alone.at  # half of what varies from report to report, and as much of what lasts in half a minute
     start = np.array([w + np.log(0.5), q, 2.0 * w - np.log(30.0)])
     flat = pieces._replace(d=0.0 * pieces.d)
-    best, distance, fit = flat, float("inf"), _best(flat, _TIME, start)
-    for scale in _SCALES if np.nanmax(pieces.d) > 0.0 else ():
+    best, distance, fit = flat, float("inf"), _best(flat, tau, start)
+    for scale in settings.scales if np.nanmax(pieces.d) > 0.0 else ():
         scaled = pieces._replace(d=pieces.d / scale)
         less = np.log(float(np.nanmean(1.0 + scaled.d**2)))
-        other = _best(scaled, _TIME, fit.at - [0.0, 0.0, less])
-        if other.value > fit.value + _GAIN:
+        other = _best(scaled, tau, fit.at - [0.0, 0.0, less])
+        if other.value > fit.value + settings.gain:
             best, distance, fit = scaled, scale, other
-    return best, distance, {_TIME: fit, _SHORT: _best(best, _SHORT, fit.at)}
+    return best, distance, fit
 
 
 class _Fit(NamedTuple):

@@ -11,6 +11,7 @@ import pyarrow as pa
 from saltus.geo import Plane
 from saltus.identify import LocalTracks
 from saltus.shapes import Int
+from saltus.tracks.colour import inflation
 from saltus.tracks.encounters import SystemTracks
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.rows import Assignments, Rows
@@ -117,9 +118,7 @@ def local_system(
 class Stated:
     """Covariances of positions by which all reports of a track together tell as much as they do.
 
-    Of errors with the correlation a^|k| between reports k intervals dt apart, a = exp(-dt / tau), the mean of many has
-    (1 + a) / (1 - a) = coth(dt / 2 tau) times the variance of as many independent ones: so much the variance of what
-    lasts counts in each report but the first of its source.
+    The variance of what lasts counts by its `inflation` in each report but the first of its source.
     """
 
     def __init__(self) -> None:
@@ -144,7 +143,7 @@ class Stated:
             dt[k] = time - self._last.get(key, -np.inf)
             self._last[key] = time
         dt[dt <= 0.0] = np.inf
-        again = 1.0 / np.tanh(0.5 * dt / m.lasting_time[at]) - 1.0
+        again = inflation(dt, m.lasting_time[at]) - 1.0
         return np.asarray(R + again[:, None, None] * (lasting @ lasting.swapaxes(1, 2)))
 
     def forget(self, before: float) -> None:

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from saltus.tracks.kinematics import Kinematics, Plan
+from saltus.tracks.channel import Plan
+from saltus.tracks.kinematics import Kinematics
 from saltus.tracks.measurements import Measurements
 
 __all__ = ["Rated", "rate_of", "with_range_rates"]

@@ -8,9 +8,21 @@ import numpy.typing as npt
 
 from saltus.errors import ModelError
 
-__all__ = ["FilterSettings", "RegistrationSettings", "SystemsSettings", "TrackerSettings"]
+__all__ = ["FilterSettings", "RegistrationSettings", "SystemsSettings", "TrackerSettings", "positive"]
 
 _FASTEST_TURN = 45.0  # degrees/s: faster, a turn is a circle between two plots
+
+
+def positive(table: str, settings: object, *names: str) -> None:
+    """Refuse fields of a table that are not positive and finite.
+
+    Raises:
+        ModelError: one is not; the message names it.
+    """
+    for name in names:
+        value = getattr(settings, name)
+        if not 0.0 < value < np.inf:
+            raise ModelError(f"{table}.{name} must be positive and finite, got {value}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,10 +178,10 @@ class TrackerSettings:
             raise ModelError(f"tracker.lasting_states is a number of states, 0 for none, got {self.lasting_states}.")
         if self.most_candidates < 1:
             raise ModelError(f"tracker.most_candidates is a number of plots, 1 or more, got {self.most_candidates}.")
-        positive = ("clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds", "split_range")
-        outliers = ("split_azimuth", "outlier_azimuth", "outlier_range", "outlier_xy", "sigma_pressure")
-        given = {name: getattr(self, name) for name in (*positive, *outliers)}
-        given["height_prior[1]"] = self.height_prior[1]
+        positive("tracker", self, "clutter_density_azimuth", "max_speed", "coast_scans", "coast_seconds", "split_range")
+        positive("tracker", self, "split_azimuth", "outlier_azimuth", "outlier_range", "outlier_xy", "sigma_pressure")
+        positive("tracker", self, "lasting_silence")
+        given = {"height_prior[1]": self.height_prior[1]}
         given |= {f"degraded_sojourn[{k}]": stay for k, stay in enumerate(self.degraded_sojourn)}
         if not np.isfinite(self.height_prior[0]):
             raise ModelError(f"tracker.height_prior[0] is a height in m, got {self.height_prior[0]}.")
@@ -229,25 +241,8 @@ class SystemsSettings:
         for name in ("p_false", "p_false_split"):
             if not 0.0 < getattr(self, name) < 0.5:
                 raise ModelError(f"systems.{name} is a probability below 0.5, got {getattr(self, name)}.")
-        for name in (
-            "split_offset",
-            "hysteresis",
-            "every",
-            "window",
-            "offset_time",
-            "spacing",
-            "speed",
-            "track_sigma",
-            "track_memory",
-            "silent",
-            "rows_kept",
-            "rivals",
-            "lately",
-            "step",
-            "evidence",
-        ):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ModelError(f"systems.{name} must be positive and finite, got {getattr(self, name)}.")
+        names = tuple(name for name in self.__slots__ if name not in ("reference", "p_false", "p_false_split"))
+        positive("systems", self, *names)
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,10 +277,7 @@ class RegistrationSettings:
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if not 0.0 < value < np.inf:
-                raise ModelError(f"registration.{name} must be positive and finite, got {value}.")
+        positive("registration", self, *self.__slots__)
 
     @property
     def prior(self) -> npt.NDArray[np.float64]:

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from saltus.errors import ModelError
+from saltus.tracks.settings import positive
 
-__all__ = ["IntakeSettings", "PeriodSettings", "SetupSettings"]
+__all__ = ["IntakeSettings", "LastingSettings", "PeriodSettings", "SetupSettings"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +44,7 @@ class SetupSettings:
         for name in ("reports", "fewest", "estimated", "vetted"):
             if not getattr(self, name) >= 1:
                 raise ModelError(f"setup.{name} is a number of reports, 1 or more, got {getattr(self, name)}.")
-        for name in ("seconds", "gap", "longest", "far"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ModelError(f"setup.{name} must be positive and finite, got {getattr(self, name)}.")
+        positive("setup", self, "seconds", "gap", "longest", "far")
         if self.longest < 1.0:
             raise ModelError(f"setup.longest is a number of times, 1 or more, got {self.longest}.")
 
@@ -68,8 +67,7 @@ class IntakeSettings:
         """Refuse settings that cannot be."""
         if not 0.0 <= self.hold < np.inf:
             raise ModelError(f"intake.hold is a time in s, 0 or more, got {self.hold}.")
-        if not 0.0 < self.wild < np.inf:
-            raise ModelError(f"intake.wild must be positive and finite, got {self.wild}.")
+        positive("intake", self, "wild")
         if not self.for_good >= 1:
             raise ModelError(f"intake.for_good is a number of reports, 1 or more, got {self.for_good}.")
 
@@ -102,10 +100,64 @@ class PeriodSettings:
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot be."""
-        for name in self.__slots__:
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ModelError(f"periods.{name} must be positive and finite, got {getattr(self, name)}.")
+        positive("periods", self, *self.__slots__)
         if not self.shortest < self.longest:
             raise ModelError(f"periods.shortest {self.shortest} s must be below periods.longest {self.longest} s.")
         if not (self.width < 1.0 and self.share <= 1.0):
             raise ModelError(f"periods.width and periods.share are shares of 1, got {self.width} and {self.share}.")
+
+
+@dataclass(frozen=True, slots=True)
+class LastingSettings:
+    """How errors that last are estimated from the straight stretches of a source's own tracks.
+
+    Attributes:
+        time: correlation time that is assumed where the stretches do not contradict it, s.
+        times: shorter ones that they may tell, s.
+        scales: distances from the sensor at which lasting errors may be 1.4 times as large as there, m.
+        gain: nats that lasting errors must explain more than white ones, or a larger scale more than a smaller one.
+        gain_per_report: nats a report that they must explain more.
+        contradicted: nats less than the best by which stretches contradict a time.
+        straight: probability of a manoeuvre from which a track is not straight.
+        margin: s around a manoeuvre that are left out.
+        fewest: reports of a stretch, at least.
+        longest: reports of a stretch, at most; what is longer is cut.
+        gap: update periods, or s if these are shorter than one, without a report that end a stretch.
+        moving: m/s: what moves slower repeats one rounded position.
+        stretches: from so many on, or from `reports` reports on, something can be told.
+        reports: see `stretches`.
+        most: reports used; stretches are left out evenly where there are more.
+        own_share: of a deviation configured as lasting (`correlation_time` without `sigma_lasting`), what each report
+            errs by itself: reports without errors of their own would outweigh all others.
+    """
+
+    time: float = 60.0
+    times: tuple[float, ...] = (35.0, 20.0, 12.0, 6.0, 3.5, 2.0)
+    scales: tuple[float, ...] = (1e4, 3e3, 1e3, 3e2)
+    gain: float = 10.0
+    gain_per_report: float = 0.01
+    contradicted: float = 2.5
+    straight: float = 0.3
+    margin: float = 8.0
+    fewest: int = 20
+    longest: int = 150
+    gap: float = 2.5
+    moving: float = 3.0
+    stretches: int = 30
+    reports: int = 1_000
+    most: int = 2_500
+    own_share: float = 0.2
+
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot be."""
+        positive("lasting", self, *(name for name in self.__slots__ if name not in ("times", "scales")))
+        for name in ("times", "scales"):
+            values = getattr(self, name)
+            if not all(0.0 < value < np.inf for value in values):
+                raise ModelError(f"lasting.{name} are positive and finite, got {values}.")
+        if not all(value < self.time for value in self.times):
+            raise ModelError(f"lasting.times are shorter than lasting.time, {self.time} s, got {self.times}.")
+        if not (self.own_share < 1.0 and self.straight < 1.0):
+            raise ModelError(
+                f"lasting.own_share and lasting.straight are shares of 1, got {self.own_share} and {self.straight}."
+            )

@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from saltus.tracks.associate import Pairs
+from saltus.tracks.channel import MOTION, Plan
 from saltus.tracks.colour import NO_SOURCE
 from saltus.tracks.faults import SourceCondition
 from saltus.tracks.gates import Gate, Gated
-from saltus.tracks.kinematics import MOTION, Kinematics, Plan
+from saltus.tracks.kinematics import Kinematics
 from saltus.tracks.lifecycle import CONFIRMED, Lifecycle
 from saltus.tracks.measurements import Measurements
 

@@ -3,12 +3,12 @@
 import numpy as np
 import numpy.typing as npt
 
+from saltus.tracks.channel import MOTION, Start
 from saltus.tracks.colour import Colours
-from saltus.tracks.kinematics import MOTION, Start, two_point_start, with_speed_prior
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.settings import FilterSettings, TrackerSettings
 
-__all__ = ["Starts", "erring"]
+__all__ = ["Starts", "erring", "two_point_start", "with_speed_prior"]
 
 _Array = npt.NDArray[np.float64]
 _Index = npt.NDArray[np.intp]
@@ -112,3 +112,53 @@ def erring(start: Start, colours: Colours, source: npt.NDArray[np.int32], time: 
         share = np.linalg.eigvalsh(held)[:, -1]
         cross *= np.sqrt(np.minimum(1.0, _HELD / np.maximum(share, 1e-12)))[:, None, None]
     return start.beside(colours, cross)
+
+
+def two_point_start(
+    first: _Array, first_cov: _Array, second: _Array, second_cov: _Array, dt: _Array, common: _Array | None = None
+) -> Start:
+    """Begin states from two positions.
+
+    Position z1, velocity (z1 - z0)/T, and blockwise over (position, velocity)
+    P = [[R1, (R1 - C)/T], [(R1 - C)'/T, (R0 + R1 - C - C')/T^2]], C = cov(error of z1, error of z0).
+
+    Args:
+        first: positions (x, y, z) at the earlier time, (k, 3).
+        first_cov: their covariances R0, (k, 3, 3).
+        second: positions at the later time, (k, 3).
+        second_cov: their covariances R1, (k, 3, 3).
+        dt: time between them T > 0, (k,), s.
+        common: C, (k, 3, 3); None: 0, each position errs by itself.
+
+    Returns:
+        States (x, vx, y, vy, z, vz) at the later time.
+
+    Source: two-point differencing; section 3 of the radar notes.
+    """
+    T, C = dt[:, None, None], np.zeros(second_cov.shape) if common is None else common
+    mean, cov = np.empty((len(dt), 6)), np.empty((len(dt), 6, 6))
+    mean[:, 0::2], mean[:, 1::2] = second, (second - first) / dt[:, None]
+    cov[:, 0::2, 0::2] = second_cov
+    cov[:, 0::2, 1::2] = (second_cov - C) / T
+    cov[:, 1::2, 0::2] = cov[:, 0::2, 1::2].swapaxes(1, 2)
+    cov[:, 1::2, 1::2] = (first_cov + second_cov - C - C.swapaxes(1, 2)) / (T * T)
+    return Start(mean, cov)
+
+
+def with_speed_prior(start: Start, sigma: float) -> Start:
+    """Condition states on their horizontal velocity being N(0, sigma^2 I).
+
+    With U = cov(x, v), S = cov(v) + sigma^2 I: x - U S^-1 v, P - U S^-1 U'. Two positions taken at nearly one time (two
+    radars) tell no velocity; this keeps what is known of speeds, and changes nothing else.
+
+    Args:
+        start: states (x, vx, y, vy, z, vz, ...).
+        sigma: standard deviation of each component, m/s.
+    """
+    v = np.array([1, 3])
+    U = start.cov[:, :, v]
+    S = start.cov[:, v[:, None], v] + sigma**2 * np.eye(2)
+    gain = np.linalg.solve(S, U.swapaxes(-1, -2)).swapaxes(-1, -2)
+    cov = start.cov - gain @ U.swapaxes(-1, -2)
+    mean = start.mean - (gain @ start.mean[:, v, None])[..., 0]
+    return start._replace(mean=mean, cov=0.5 * (cov + cov.swapaxes(-1, -2)))

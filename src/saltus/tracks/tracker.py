@@ -9,11 +9,12 @@ import numpy.typing as npt
 from saltus.linalg import logsumexp
 from saltus.tracks.associate import assign
 from saltus.tracks.background import densities
+from saltus.tracks.channel import MOTION
 from saltus.tracks.faults import SourceCondition, plot_law
 from saltus.tracks.gates import Gate, Gated
 from saltus.tracks.identity import identity_gain
 from saltus.tracks.kept import Kept
-from saltus.tracks.kinematics import MOTION, make_kinematics
+from saltus.tracks.kinematics import make_kinematics
 from saltus.tracks.lifecycle import CONFIRMED, SEED, TENTATIVE, Birth, Lifecycle
 from saltus.tracks.measurements import Measurements
 from saltus.tracks.publish import Told, coast, updated_rows
