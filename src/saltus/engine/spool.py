@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from saltus.io.write import blamed
 from saltus.tracks.rows import Rows, join_rows
 
 __all__ = ["InOrder", "Place", "Spool", "Stored"]
@@ -32,11 +33,14 @@ class Stored:
 
     def table(self) -> pa.Table:
         """Return the table, mapped into memory: what is not looked at stays on disk."""
-        return pa.ipc.open_file(pa.memory_map(str(self._path))).read_all()
+        with blamed(self._path):
+            return pa.ipc.open_file(pa.memory_map(str(self._path))).read_all()
 
     def batches(self) -> Iterator[pa.Table]:
         """Read it batch by batch; an empty table is one."""
-        with pa.OSFile(str(self._path)) as file:
+        with blamed(self._path):
+            opened = pa.OSFile(str(self._path))
+        with opened as file:
             reader = pa.ipc.open_file(file)
             for k in range(reader.num_record_batches):
                 yield pa.Table.from_batches([reader.get_batch(k)])
@@ -50,7 +54,8 @@ class Spool:
     def __init__(self, place: Place, name: str) -> None:
         """Begin with nothing written."""
         self._place, self._path = place, place.path / f"{name}.arrow"
-        self._sink = pa.OSFile(str(self._path), "wb")
+        with blamed(self._path):
+            self._sink = pa.OSFile(str(self._path), "wb")
         self._writer: pa.ipc.RecordBatchFileWriter | None = None
 
     def write(self, table: pa.Table) -> None:
@@ -58,13 +63,15 @@ class Spool:
         if self._writer is None:
             self._writer = pa.ipc.new_file(self._sink, table.schema)
         if table.num_rows:
-            self._writer.write_table(table.combine_chunks())
+            with blamed(self._path):
+                self._writer.write_table(table.combine_chunks())
 
     def stored(self) -> Stored:
         """End the table."""
-        if self._writer is not None:
-            self._writer.close()
-        self._sink.close()
+        with blamed(self._path):
+            if self._writer is not None:
+                self._writer.close()
+            self._sink.close()
         return Stored(self._place, self._path)
 
 

@@ -153,7 +153,7 @@ def write_batches(path: Path, batches: Iterable["pa.Table"]) -> None:
 
 @contextmanager
 def blamed(path: Path) -> Iterator[None]:
-    """Name the file in failures to write that do not: systems name it when it is opened, not when the disk is full."""
+    """Name the file in failures that do not: systems name it when it is opened, not when the disk is full."""
     try:
         yield
     except OSError as error:
