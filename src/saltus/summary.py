@@ -118,13 +118,16 @@ def _lasting(sensor: SensorSetup) -> dict[str, object] | None:
     noise, scale = sensor.noise, 180.0 / np.pi if sensor.kind != Kind.PLANE else 1.0
     if not noise.lasting:
         return None
-    configured = "lasting" in sensor.given
-    told = "configured" if configured else "told by its tracks" if sensor.estimate.lasting_told else "assumed"
+    told = "told by its tracks" if sensor.estimate.lasting_told and "lasting" not in sensor.given else "assumed"
     return {
-        "sigma_lasting": _rounded(noise.lasting * scale),
-        "unit": "m" if scale == 1.0 else "degrees",
+        "sigma_lasting": {
+            "configured": _rounded(sensor.given.get("lasting", np.nan) * scale),
+            "estimated": _rounded(sensor.estimate.lasting * scale),
+            "used": _rounded(noise.lasting * scale),
+        },
+        "unit": "m" if sensor.kind == Kind.PLANE else "degrees",
         "correlation_time_s": _rounded(noise.lasting_time),
-        "correlation_time": "configured" if "lasting_time" in sensor.given else told if not configured else "assumed",
+        "correlation_time": "configured" if "lasting_time" in sensor.given else told,
         "lasting_scale_distance_m": _rounded(noise.lasting_distance),
         "gain_nats_per_report": _rounded(sensor.estimate.lasting_gain),
     }
@@ -159,10 +162,15 @@ def noise_rows(summary: dict[str, Any]) -> dict[str, object]:
     """Lay the noise table out for people: a row for each source and quantity, the same columns in all."""
     rows: dict[str, object] = {}
     for name, row in summary["noise"].items():
+        figures = {"update_period_s": row["update_period_s"], "nis": row["nis_mean"]}
         for label, unit in _UNITS.items():
             if label in row:
-                figures = {"update_period_s": row["update_period_s"], "nis": row["nis_mean"]}
                 rows[f"{name}, {unit}"] = {**row[label], **figures}
+        lasting = row["lasting"]
+        if lasting is not None:
+            unit = "m" if lasting["unit"] == "m" else "°"
+            told = f"for τ {lasting['correlation_time_s']} s, {lasting['correlation_time']}"
+            rows[f"{name}, σ of errors that last ({told}), {unit}"] = {**lasting["sigma_lasting"], **figures}
     return rows
 
 
@@ -261,7 +269,7 @@ def _said_of_lasting(lasting: dict[str, Any] | None) -> str:
     """Say what of a source's errors lasts, and how long."""
     if lasting is None:
         return ""
-    said = f"; beside it errors of {lasting['sigma_lasting']} {lasting['unit']} last"
+    said = f"; beside it errors of {lasting['sigma_lasting']['used']} {lasting['unit']} last"
     if lasting["lasting_scale_distance_m"] is not None:
         said += f" (1.4 times as large at {lasting['lasting_scale_distance_m']:g} m from the sensor)"
     return f"{said}, correlation time {lasting['correlation_time_s']} s ({lasting['correlation_time']})"

@@ -6,6 +6,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from saltus.run import track_files
+from saltus.summary import noise_rows
 
 
 def flights(rng, folder, *, tau, lasting, white):
@@ -35,7 +36,10 @@ def test_what_lasts_is_found_and_the_covariance_holds(rng, tmp_path):
     truth = flights(rng, tmp_path, tau=30.0, lasting=20.0, white=3.0)
     summary = track_files([tmp_path / "mlat.parquet"], tmp_path / "out", tmp_path / "site.toml", report=False)
     said = summary["noise"]["mlat"]["lasting"]
-    assert 12.0 < said["sigma_lasting"] < 36.0
+    assert 12.0 < said["sigma_lasting"]["used"] < 36.0
+    assert said["sigma_lasting"]["configured"] is None
+    (row,) = (row for label, row in noise_rows(summary).items() if "errors that last" in label)
+    assert row["used"] == said["sigma_lasting"]["used"]
     assert said["correlation_time"] in ("assumed", "told by its tracks")
     tracks = pq.read_table(tmp_path / "out" / "tracks.parquet")
     nees, quiet = [], []
