@@ -239,6 +239,8 @@ def covariances(name: str, a: _Array) -> _Array:
     Raises:
         ModelError: one is not symmetric or not positive semidefinite; the message has its index.
     """
+    if a.shape[-1] == 1 and not (a < 0.0).any():
+        return a.copy()
     swapped = a.swapaxes(-1, -2)
     sigma = np.sqrt(np.maximum(np.diagonal(a, axis1=-2, axis2=-1), 0.0))
     scale = sigma[..., :, None] * sigma[..., None, :]

@@ -157,8 +157,9 @@ def estimate_lasting(
     top = max(tried.values(), key=lambda fit: fit.value)
     if top.value - alone.value < max(settings.gain, settings.gain_per_report * n):
         return Lasting(float(np.exp(alone.at[0])), gain=(top.value - alone.value) / n, reports=n)
-    for tau in settings.times if told is None else ():
-        tried[tau] = tried.get(tau) or _best(pieces, tau, top.at)
+    times = sorted((assumed, *settings.times)) if told is None else [assumed]
+    while (time := _wanting(tried, times, settings.contradicted)) is not None:
+        tried[time] = _best(pieces, time, top.at)
     top = max(tried.values(), key=lambda fit: fit.value)
     tau = _longest(tried, top.value - settings.contradicted)
     fit = tried[tau] if tau in tried else _best(pieces, tau, top.at)
@@ -249,6 +250,20 @@ class _Likelihood:
             keep="last",
         )
         return np.asarray(found.log_likelihood.sum(axis=(1, 2)))
+
+
+def _wanting(tried: Mapping[float, _Fit], times: list[float], contradicted: float) -> float | None:
+    """Return a time not yet tried that the best, or the longest that the data do not contradict, may yet turn on."""
+    top = max(tried, key=lambda tau: tried[tau].value)
+    least, k = tried[top].value - contradicted, times.index(top)
+    if k > 0 and times[k - 1] not in tried:
+        return times[k - 1]
+    for tau in times[k + 1 : k + 2] if tried[times[-1]].value >= least else times[k + 1 :]:
+        if tau not in tried:
+            return tau
+        if tried[tau].value < least:
+            break
+    return None
 
 
 def _longest(tried: Mapping[float, _Fit], least: float) -> float:
